@@ -152,9 +152,3 @@ NO_PPS = warning_kind(
 BOARD_WITHOUT_UTC = warning_kind(
     "clock.board_without_utc", "the board does not know UTC yet: the LiDAR's hour is unknown"
 )
-
-SETTING_DIFFERS = warning_kind(
-    "settings.differs",
-    "{setting} {value} ({expected} expected)",
-    "correct it on the LiDAR's web page, or in the profile",
-)

@@ -26,7 +26,6 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource, SourceStatus
-from lce_rig.devices.velodyne_web import read_page
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
@@ -38,7 +37,6 @@ _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
 _WAIT_S = 0.1
 _GATHER_S = 0.005
-_WEB_TIMEOUT_S = 1.0
 
 # Two seconds of data packets, as the kernel accounts for them.
 _WANTED_BUFFER_BYTES = 4 << 20
@@ -66,22 +64,18 @@ class Vlp16Source(LiveSource):
         sensor: its name in the profile.
         settings: its block of the profile.
         silence_s: without packets for so long, it is taken to be gone.
-        web_port: of the sensor's web server, which is asked for the serial number.
     """
 
-    def __init__(
-        self, sensor: str, settings: LidarSettings, silence_s: float = SILENCE_S, web_port: int = 80
-    ) -> None:
+    def __init__(self, sensor: str, settings: LidarSettings, silence_s: float = SILENCE_S) -> None:
         super().__init__(sensor, sensor, silence_s)
         self._settings = settings
         self._port = settings.driver.port or velodyne.DATA_PORT
-        self._web_port = web_port
         self._lock = threading.Lock()
         self._stream: Vlp16Stream | None = None
         self._recorder: Sink[Datagram] | None = None
         self._ports: tuple[UdpPort, ...] = ()
         self._early: list[Scan] = []
-        self._address = self._serial = ""
+        self._address = ""
         self._strangers: Counter[str] = Counter()
         self._n_lost_before = 0
 
@@ -116,14 +110,12 @@ class Vlp16Source(LiveSource):
         with self._lock:
             self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
             self._stream, self._early = stream, []
-            self._address, self._serial, self._strangers = self._settings.driver.address or "", "", Counter()
+            self._address, self._strangers = self._settings.driver.address or "", Counter()
         until_s = time.monotonic() + self._silence_s
         while not stream.n_data and not self.is_stopping:
             self._early = self.read()
             if not stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
-        # Packets hold no serial number, and must not wait until a web page has answered.
-        threading.Thread(target=self._ask_serial, args=(self._address,), daemon=True).start()
 
     def read(self) -> list[Scan]:
         """Take the packets that came, and give the scans that they complete.
@@ -172,7 +164,6 @@ class Vlp16Source(LiveSource):
                 clock=state,
                 problems=tuple(problems),
                 device=f"{stream.product.name} at {self._address}" if stream.n_data else "",
-                serial=self._serial,
                 rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
                 n_packets=stream.n_data,
             )
@@ -237,12 +228,6 @@ class Vlp16Source(LiveSource):
             rotor = findings.ROTOR_RATE(rotor_hz=rotor_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
             problems.append(rotor)
         return problems
-
-    def _ask_serial(self, address: str) -> None:
-        with contextlib.suppress(SourceError):
-            info = read_page(address, self._web_port, _WEB_TIMEOUT_S, "info")
-            if address == self._address:
-                self._serial = str(info.get("serial", "")).strip()
 
 
 class _Vector(ctypes.Structure):

@@ -10,21 +10,19 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lce_rig.core import velodyne
 from lce_rig.core.data import Image, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity, worst
 from lce_rig.devices import sensors, source_of
 from lce_rig.devices.findings import BOARD_NOT_TIED
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.velodyne_web import WebReport, find_problems, read_web
 from lce_rig.doctor import findings
 from lce_rig.doctor.observing import Examination, ObservedSensor, observe
 from lce_rig.rig import Rig
@@ -44,7 +42,6 @@ _MAX_OFF_RATE, _MAX_OFF_PULSES = 0.05, 0.02
 _MAX_LOST_SHARE = 0.01
 _STOPPED_S = 1.0
 _US_PER_S = 1e6
-_WEB_TIMEOUT_S = 1.0
 _SIGMA_PER_MAD = 1.4826
 # Frames and lines come in bursts: how many are still on their way differs.
 _ROOM, _MAX_UNLIKE = 2, 0.01
@@ -96,28 +93,8 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
         yield findings.FAILED(what=what, hint=seen.failure.hint)
         return
     assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
-    figures: dict[str, Any] = {"device": seen.status.device}
-    report = exam.web.get(sensor)
-    if isinstance(report, Mapping):
-        figures |= {name: report.get(name, "") for name in ("firmware", "serial")}
-    yield findings.ANSWERS(**figures)
+    yield findings.ANSWERS(device=seen.status.device)
     yield from exam.problems(sensor, "device")
-
-
-def check_settings(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Compare what the web page of a VLP-16 says with the profile."""
-    report = exam.web.get(sensor)
-    if isinstance(report, SourceError):
-        # A sensor that sends nothing has a line already, with all there is to check.
-        if exam.seen[sensor].status is not None:
-            yield findings.SETTINGS_UNKNOWN(what=report.what)
-    elif report is not None:
-        names = ("returns", "fov_deg", "host", "data_port")
-        figures: dict[str, Any] = {name: report.get(name) for name in names}
-        yield findings.SETTINGS(**figures)
-        problems = find_problems(report, exam.rig.lidars[sensor])
-        # The pulse has a line of its own.
-        yield from (problem for problem in problems if problem.figures["setting"] != "PPS")
 
 
 def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
@@ -204,15 +181,11 @@ def check_clock(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 def check_pps(exam: Examination, sensor: str) -> Iterator[Finding]:
     """Check whether a LiDAR is locked to pulses and knows UTC, and which clock its scans carry."""
-    status, report, lidar = exam.seen[sensor].status, exam.web.get(sensor), exam.rig.lidars[sensor]
+    status, lidar = exam.seen[sensor].status, exam.rig.lidars[sensor]
     if status is None or status.clock is None:
         return
     clock = status.clock
-    figures: dict[str, Any] = {
-        "pps": report.get("pps") if isinstance(report, Mapping) else None,
-        "has_position": "pps" in clock.figures,
-        **clock.figures,
-    }
+    figures: dict[str, Any] = {"pps": None, "has_position": "pps" in clock.figures, **clock.figures}
     yield findings.PULSE(**figures)
     if status.is_utc or lidar.timestamps.clock != "utc":
         yield replace(clock, severity="note")
@@ -350,7 +323,6 @@ CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = 
     "computer": {"disk": check_disk, "clock": check_computer_clock},
     "lidar": {
         "device": check_device,
-        "settings": check_settings,
         "stream": check_stream,
         "PPS": check_pps,
     },
@@ -400,7 +372,7 @@ class Check:
         return {name: figure for each in self.findings for name, figure in each.figures.items()}
 
 
-def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: int = 80) -> list[Check]:
+def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Check]:
     """Look at the computer and every sensor of a rig.
 
     What is absent or fails is an error; everything else is looked at all the same. Takes the duration, and
@@ -410,7 +382,6 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: 
         rig: the profile.
         duration_s: for how long the sensors are watched.
         folder: where sessions are to be written.
-        web_port: of a VLP-16's web server.
 
     Returns:
         A line for each thing looked at: the computer's, each sensor's, the rig's.
@@ -422,16 +393,6 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: 
         except SourceError as error:
             seen[sensor] = ObservedSensor(sensor, failure=error)
     exam = Examination(rig, folder, seen | observe(sources, duration_s))
-    web: dict[str, WebReport | SourceError] = {}
-    for name, lidar in rig.lidars.items():
-        if exam.driver(name) == "vlp16":
-            try:
-                web[name] = read_web(
-                    lidar.driver.address or velodyne.FACTORY_ADDRESS, web_port, _WEB_TIMEOUT_S
-                )
-            except SourceError as error:
-                web[name] = error
-    exam = replace(exam, web=web)
     subjects = [("computer", "computer"), *((name, "lidar") for name in rig.lidars)]
     subjects += [*((name, "camera") for name in rig.cameras), *([(BOARD, "sync")] if rig.sync else [])]
     lines = [

@@ -4,12 +4,8 @@ from lce_rig.core.findings import Finding, Kind, note_kind, warning_kind
 
 
 def _answers(finding: Finding) -> str:
-    """{device} answers, firmware {firmware}, serial number {serial}."""
-    figures = finding.figures
-    parts = [str(figures["device"] or "answers")]
-    return ", ".join(
-        parts + [f"{name} {figures[name]}" for name in ("firmware", "serial") if figures.get(name)]
-    )
+    """{device} answers."""
+    return str(finding.figures["device"] or "answers")
 
 
 def _rate(finding: Finding) -> str:
@@ -79,12 +75,6 @@ LOSSES = Kind(
     "check its cable; close other programs (top shows which are busy)",
     actions={"named": ""},
 )
-SETTINGS_UNKNOWN = warning_kind(
-    "settings.unknown",
-    "firmware and settings unknown: {what}",
-    "check that driver.address is its own, and that no firewall blocks it",
-)
-SETTINGS = note_kind("settings.read", "{returns} returns, {fov_deg} deg, to {host}, port {data_port}")
 
 PULSE = note_kind("clock.pulse", _pulse)
 WITHOUT_PULSES = note_kind(

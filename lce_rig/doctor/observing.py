@@ -13,7 +13,6 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices import driver_of
 from lce_rig.devices.reading import AttachedSensors, LiveSource, SourceStatus
 from lce_rig.devices.sync_board import SyncBoard
-from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
@@ -85,13 +84,11 @@ class Examination:
         rig: the profile.
         folder: where sessions are to be written.
         seen: what was observed, by the sensor's name.
-        web: what the web page of each VLP-16 says, or why it says nothing, by name.
     """
 
     rig: Rig
     folder: Path = Path()
     seen: Mapping[str, ObservedSensor] = field(default_factory=dict)
-    web: Mapping[str, WebReport | SourceError] = field(default_factory=dict)
 
     def problems(self, sensor: str, *families: str) -> list[Finding]:
         """Return the problems that a sensor's driver names, of some families of codes."""

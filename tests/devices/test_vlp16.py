@@ -19,7 +19,6 @@ from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.attached import attached
-from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settings
 from tests.shared import changed, files_up_to, wait_until
 
@@ -137,18 +136,6 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
         assert int(scan.host_ns or 0) - int(scan.stamp_ns or 0) >= PERIOD_NS - 2_000_000
 
 
-def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar):
-    with serving(PAGES) as port, streaming(lidar, Room(3), web_port=port) as (source, samples):
-        take(samples, 1)
-        wait_until(lambda: source.status().serial == PAGES["info"]["serial"])
-    with (
-        serving({"info": b"<html>a camera</html>"}) as port,
-        streaming(lidar, Room(5), web_port=port) as (source, samples),
-    ):
-        take(samples, 4)
-        assert source.status().serial == ""
-
-
 @pytest.mark.parametrize("address", [HERE, None])
 def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(lidar, address):
     room = Room(3)
@@ -177,7 +164,7 @@ def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar):
 
 def explain(lidar, packets=None, **options):
     """The error of opening a source that nothing good comes to."""
-    source = Vlp16Source("lidar", lidar, **{"silence_s": 0.3, "web_port": 9, **options})
+    source = Vlp16Source("lidar", lidar, **{"silence_s": 0.3, **options})
     sending = Sender(lidar, source).sending(lambda _: packets or [])
     with pytest.raises(SourceError) as caught, sending, attached(source):
         pass
@@ -192,7 +179,7 @@ def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar):
 
 
 def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar):
-    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as (_, samples):
+    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0) as (_, samples):
         assert len(take(samples, 2)) == 2
         with pytest.raises(SourceError, match=str(lidar.driver.port)):
             list(samples)

@@ -1,12 +1,11 @@
-"""A rig attached by real transports: a VLP-16 on loopback, its web page, a camera's pipe, a board's pty."""
+"""A rig attached by real transports: a VLP-16 on loopback, a camera's pipe, a board's pty."""
 
 import socket
 import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, free_po
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.rig import Rig
-from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import T0_NS, room_scan
 
 HERE = "127.0.0.1"
@@ -67,12 +65,11 @@ class Attached:
     scan: Scan | None = None
     clock: Vlp16Clock | None = None
     has_board: bool = True
-    pages: dict[str, Any] = field(default_factory=dict)
 
 
 @contextmanager
 def attach(attached, folder):
-    """Attach everything; gives the profile that reaches it, and the web server's port."""
+    """Attach everything; gives the profile that reaches it."""
     ports = free_ports()
     document = attached.rig.model_dump()
     document["lidars"]["lidar"]["driver"] = {
@@ -85,9 +82,6 @@ def attach(attached, folder):
     trigger = {"channel": 0, "rate_hz": 1 / PERIOD_S, "max_delay_s": 0.04}
     document["sync"] = {"device": "/dev/not-there", "triggers": {"cam": trigger}}
     with ExitStack() as stack:
-        host = {**PAGES["settings"]["host"], "dport": ports[0], "tport": ports[1]}
-        settings = {**PAGES["settings"], "host": host}
-        web = stack.enter_context(serving({**PAGES, "settings": settings, **attached.pages}))
         if attached.scan is not None:
             sender = Vlp16Sender(attached.scan, ports, attached.clock)
             sender.start()
@@ -95,7 +89,7 @@ def attach(attached, folder):
             stack.callback(sender.stop.set)
         if attached.has_board:
             document["sync"]["device"] = stack.enter_context(FakeBoard(period_s=PERIOD_S)).path
-        yield Rig.model_validate(document), web
+        yield Rig.model_validate(document)
 
 
 def _camera(pixels, folder):

@@ -43,8 +43,8 @@ def make_rig(**changes):
     return Rig.model_validate({**profile, **changes})
 
 
-def examination(*seen, rig=None, web=None):
-    return Examination(rig or make_rig(), seen={each.sensor: each for each in seen}, web=web or {})
+def examination(*seen, rig=None):
+    return Examination(rig or make_rig(), seen={each.sensor: each for each in seen})
 
 
 def look(check, *arguments):

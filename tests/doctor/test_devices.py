@@ -23,14 +23,6 @@ def test_what_does_not_open_is_red_with_what_to_check():
     assert look(check_stream, examination(seen), "cam") is None
 
 
-def test_a_lidar_is_named_with_what_its_web_page_says():
-    web = {"lidar": {"model": "VLP-16", "serial": "AG43510116", "firmware": "3.0.41.1"}}
-    line = look(check_device, examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
-    assert codes(line) == ["sensor.answers"] and line.severity == "note"
-    told = ("device", "firmware", "serial")
-    assert [line.figures[name] for name in told] == ["VLP-16 at 127.0.0.1", "3.0.41.1", "AG43510116"]
-
-
 def test_complaints_of_a_driver_stand_in_the_line_they_belong_to():
     status = {
         "device": "DAVIS346",

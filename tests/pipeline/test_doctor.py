@@ -13,17 +13,17 @@ from tests.doctor.observed import codes, make_rig
 Lines = dict[tuple[str, str], Check]
 
 
-def doctor(rig, folder, web_port, duration_s=2.0):
-    checks = examine(rig, duration_s, folder, web_port)
+def doctor(rig, folder, duration_s=2.0):
+    checks = examine(rig, duration_s, folder)
     assert len({(check.subject, check.name) for check in checks}) == len(checks)
     return {(check.subject, check.name): check for check in checks}
 
 
-def doctor_until_scanned(rig, folder, web_port, duration_s=2.0):
+def doctor_until_scanned(rig, folder, duration_s=2.0):
     """Examine a rig whose LiDAR is there; longer where a computer that is busy with others sends too late."""
     for watch_s in (duration_s, 3 * duration_s, 9 * duration_s):
         start_s = time.monotonic()
-        lines = doctor(rig, folder, web_port, watch_s)
+        lines = doctor(rig, folder, watch_s)
         took_s = time.monotonic() - start_s
         if ("lidar", "PPS") in lines and "clock.no_position_packets" not in codes(lines["lidar", "PPS"]):
             break
@@ -34,15 +34,14 @@ def doctor_until_scanned(rig, folder, web_port, duration_s=2.0):
 def everything(tmp_path_factory):
     """The lines of a rig that is all there, how long it was watched for, and how long that took."""
     rig, folder = make_rig(), tmp_path_factory.mktemp("everything")
-    with attach(Attached(rig, PIXELS, SCAN), folder) as (reached, web_port):
-        return doctor_until_scanned(reached, folder, web_port, 3.0)
+    with attach(Attached(rig, PIXELS, SCAN), folder) as reached:
+        return doctor_until_scanned(reached, folder, 3.0)
 
 
 def test_every_device_of_an_attached_rig_answers_by_name(everything):
     lines, *_ = everything
     assert lines["lidar", "device"].severity == "note"
-    told = lines["lidar", "device"].figures
-    assert (told["firmware"], told["serial"]) == ("3.0.41.1", "AG43510116")
+    assert "VLP-16" in str(lines["lidar", "device"].figures["device"])
     assert lines["cam", "device"].severity == "note"
     assert "LCE1" in str(lines["sync", "device"].figures["device"])
 
@@ -60,13 +59,10 @@ def test_its_streams_come_and_none_of_them_is_lost(everything):
     assert by_line["cam"].figure("rate_hz") > 0
 
 
-def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything):
+def test_its_lidar_is_locked(everything):
     lines, *_ = everything
     pulse = lines["lidar", "PPS"].findings[0].figures
     assert pulse["pps"] == "locked" and pulse["nmea_past_hour_s"] is not None
-    settings = lines["lidar", "settings"]
-    assert settings.severity == "note" and settings.figures["returns"] == "strongest"
-    assert settings.figures["fov_deg"] == (0, 359)
 
 
 def test_its_clocks_are_compared(everything):
@@ -79,8 +75,8 @@ def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path):
     rig = make_rig()
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
     attached = Attached(rig, None, SCAN, unlocked)
-    with attach(attached, tmp_path) as (reached, web_port):
-        lines, *_ = doctor_until_scanned(reached, tmp_path, web_port)
+    with attach(attached, tmp_path) as reached:
+        lines, *_ = doctor_until_scanned(reached, tmp_path)
     assert lines["cam", "device"].severity == "error" and ("cam", "stream") not in lines
     assert lines["lidar", "device"].severity == "note"
     # The profile promises a clock tied by hardware.
