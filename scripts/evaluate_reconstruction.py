@@ -17,7 +17,7 @@ import torch
 from training.event_simulation import EventStream
 from training.textures import TEXTURE_PX, draw_checkerboard
 
-from lce_rig.detect.events.reconstructor import IntensityScale, ReconstructionModel
+from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, IntensityScale, ReconstructionModel
 
 HELD_OUT_SEED = 2_000_000_000
 SIZE_PX = 192
@@ -91,7 +91,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--model", type=Path, help="ONNX file; left out: the shipped one")
+    parser.add_argument(
+        "--model", type=Path, default=SHIPPED_NETWORK, help="ONNX file; left out: the shipped one"
+    )
     parser.add_argument("--scenes", type=int, default=40)
     parser.add_argument("--windows", type=int, default=60)
     parser.add_argument("--every", type=int, default=8, help="judge every so many windows")

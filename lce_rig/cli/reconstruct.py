@@ -40,7 +40,6 @@ _WARM_UP_NS = 1_500_000_000
 )
 @click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End S seconds after the beginning.")
 @click.option("--topic", metavar="/TOPIC", help="Choose the topic if a bag has several with events.")
-@path_option("--model", "FILE", "Use this ONNX file instead of the shipped network.")
 def reconstruct(
     recording: Path,
     output: Path,
@@ -48,14 +47,13 @@ def reconstruct(
     start: float,
     duration: float | None,
     topic: str | None,
-    model: Path | None,
 ) -> None:
     """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
 
     Reads AEDAT4, Prophesee RAW (EVT3), ROS 1, ROS 2 and mcap bags, and HDF5 in DSEC's layout. Skips the
     first images, until the network has settled, and prints how many.
     """
-    reconstructor = Reconstructor(model)
+    reconstructor = Reconstructor()
     events = open_events(recording, topic=topic)
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:

@@ -10,7 +10,6 @@ from lce_rig.cli.options import require_sensors
 from lce_rig.core.errors import ProfileError, SourceError, UsageError
 from lce_rig.io import RECORDINGS
 from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
-from lce_rig.pipeline.detect_session import check_networks
 from lce_rig.pipeline.new_profile import BOARD_FORM, clouds_in, parse_board, parse_intrinsics
 from lce_rig.pipeline.new_profile import new_profile as draft
 from lce_rig.rig import (
@@ -68,7 +67,6 @@ def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
 def check_profile(file: str) -> None:
     """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
     rig = load_rig(file)
-    check_networks(rig)
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
     show.warn_of(rig.warnings())
 

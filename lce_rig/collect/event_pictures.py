@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator
 from lce_rig.collect.findings import READ_EVENTS_GONE_BY, READ_EVENTS_NOT_BEGUN
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.findings import Losses, Refusal
-from lce_rig.detect.events.search import reconstructor_for
+from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns
 from lce_rig.timing.scan_pairing import PATIENCE_NS, middle_of_sweep_ns
@@ -31,7 +31,6 @@ def with_event_pictures(
             then depend on which scans came.
 
     Raises:
-        ProfileError: a network cannot be used.
         SourceError: onnxruntime is not installed; or, from the samples, they are torn.
     """
     darkrooms = [_Darkroom(rig, camera, tally, is_live) for camera in sorted(cameras)]
@@ -52,7 +51,7 @@ class _Darkroom:
         self._camera = camera
         self._tally = tally
         self._is_live = is_live
-        self._reconstructor = reconstructor_for(rig.cameras[camera].channels[channel].reconstruction, channel)
+        self._reconstructor = Reconstructor(channel)
         self._offset_ns = rig_offset_ns(Stream(camera, channel, "events"), rig)
         self._wanted: deque[int] = deque()
         self._packets: deque[Events] = deque()

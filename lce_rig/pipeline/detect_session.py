@@ -18,10 +18,11 @@ from lce_rig.core.geometry import Array, invert
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair, from_arrays, to_arrays
-from lce_rig.detect.events.search import EventSighting, find_event_board, reconstructor_for
+from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
+from lce_rig.detect.events.search import EventSighting, find_event_board
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.findings import NO_AGREEMENT
-from lce_rig.rig import ReconstructionSettings, Rig
+from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
 from lce_rig.session.durable import load_arrays, store_arrays
 
@@ -49,9 +50,6 @@ def detect(
         session: open for reading is enough.
         progress: called with (done, total).
         n_threads: detectors that run in parallel.
-
-    Raises:
-        ProfileError: a network that the profile names cannot be used.
     """
     finder = _Finder(session)
     scan_jobs, image_jobs, event_jobs = finder.jobs(session.captures)
@@ -117,7 +115,9 @@ class _Finder:
         self._session = session
         self._boards = BoardFinder(session.rig)
         self._digest = detection_digest(session.rig)
-        self._event_digests: dict[Key, str] = {}
+        # Images depend on the network, too.
+        with_network = hashlib.sha256(self._digest.encode() + SHIPPED_NETWORK.read_bytes())
+        self._event_digest = with_network.hexdigest()[:12]
 
     def jobs(
         self, captures: Sequence[Capture]
@@ -175,30 +175,25 @@ class _Finder:
     def events(
         self, capture: Capture, camera: str, channel: str, scans: Mapping[str, LidarDetection]
     ) -> ImageDetection:
-        """Find the board in raw events, and keep the reconstructed image.
-
-        Raises:
-            ProfileError: the network cannot be used.
-        """
-        digest = self._event_digest(camera, channel)
+        """Find the board in raw events, and keep the reconstructed image."""
 
         def find() -> ImageDetection:
             sighting = self._see(capture, camera, channel, scans)
-            self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), sighting.picture)
+            key = _cache_key(self._event_digest, capture, f"{camera}.{channel}.picture")
+            self._keep(key, sighting.picture)
             return sighting.board
 
-        return self._remembered(digest, capture, f"{camera}.{channel}", find)
+        return self._remembered(self._event_digest, capture, f"{camera}.{channel}", find)
 
     def picture(
         self, capture: Capture, camera: str, channel: str, scans: Mapping[str, LidarDetection]
     ) -> Image | Refusal:
-        """Return the image reconstructed from raw events; raises as `events`."""
+        """Return the image reconstructed from raw events."""
 
         def find() -> Image | Refusal:
             return self._see(capture, camera, channel, scans).picture
 
-        digest = self._event_digest(camera, channel)
-        return self._remembered(digest, capture, f"{camera}.{channel}.picture", find)
+        return self._remembered(self._event_digest, capture, f"{camera}.{channel}.picture", find)
 
     def _see(
         self, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
@@ -211,28 +206,15 @@ class _Finder:
         if stamp_ns is None:
             stamp_ns = int(events.t_ns[-1]) if len(events) else 0
         boards = [(name, found[0]) for name, found in lidars.items() if isinstance(found, list) and found]
-        settings = rig.cameras[camera].channels[channel].reconstruction
         return find_event_board(
             events,
             stamp_ns,
-            reconstructor_for(settings, channel),
+            Reconstructor(channel),
             rig.board.to_board(),
             rig.cameras[camera].to_intrinsics(),
             rig.quality,
             sweep_s=sweep_time_s(boards[0][1], 1 / rig.lidars[boards[0][0]].rate_hz) if boards else None,
         )
-
-    def _event_digest(self, camera: str, channel: str) -> str:
-        """Hash the inputs of images from a channel's events besides the capture, to 12 digits."""
-        from lce_rig.detect.events.reconstructor import model_bytes
-
-        if (camera, channel) not in self._event_digests:
-            stated = self._session.rig.cameras[camera].channels[channel].reconstruction
-            settings = stated or ReconstructionSettings()
-            digest = hashlib.sha256(f"{self._digest} {settings.model_dump_json()}".encode())
-            digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
-            self._event_digests[camera, channel] = digest.hexdigest()[:12]
-        return self._event_digests[camera, channel]
 
     def _remembered(
         self, digest: str, capture: Capture, sensor: str, find: Callable[[], _Found]
@@ -309,18 +291,6 @@ def picture_stamp_ns(
         own = rig.cameras[camera].channels[channel].timestamps.expected_offset_s
         return stamp_ns + seen_ns + round(1e9 * (settings.timestamps.expected_offset_s - own))
     return None
-
-
-def check_networks(rig: Rig) -> None:
-    """Check that every network that a profile names is usable.
-
-    Raises:
-        ProfileError: one is not.
-    """
-    for camera in rig.cameras.values():
-        for name, channel in camera.channels.items():
-            if channel.reconstruction is not None and channel.reconstruction.model is not None:
-                reconstructor_for(channel.reconstruction, name)
 
 
 def candidates_of(detections: Detections, pair: Pair) -> tuple[list[Observation], dict[str, Refusal]]:

@@ -11,7 +11,6 @@ from lce_rig.rig.sensors import (
     IntrinsicsSettings,
     LidarIntrinsicsSettings,
     LidarSettings,
-    ReconstructionSettings,
     TimestampSettings,
 )
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
@@ -27,7 +26,6 @@ __all__ = [
     "LidarSettings",
     "NominalExtrinsic",
     "QualitySettings",
-    "ReconstructionSettings",
     "Rig",
     "TimestampSettings",
     "VerdictSettings",

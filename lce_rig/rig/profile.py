@@ -330,14 +330,8 @@ class Rig(Settings):
 
     def located(self, folder: Path) -> "Rig":
         """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
-        cameras = {
-            name: camera.model_copy(
-                update={"channels": {key: each.located(folder) for key, each in camera.channels.items()}}
-            )
-            for name, camera in self.cameras.items()
-        }
         targets = {name: target.located(folder) for name, target in self.targets.items()}
-        return self.model_copy(update={"cameras": cameras, "targets": targets})
+        return self.model_copy(update={"targets": targets})
 
     def warnings(self) -> Iterator[Finding]:
         """List valid but probably unintended settings; the subject is the key."""

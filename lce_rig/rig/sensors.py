@@ -1,6 +1,5 @@
 """The sensors' blocks of a profile: LiDARs, cameras, their channels, drivers and clocks."""
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -244,57 +243,23 @@ class IntrinsicsSettings(Settings):
         return self
 
 
-class ReconstructionSettings(Settings):
-    """Settings of image reconstruction from a channel's events.
-
-    Attributes:
-        method: how; the recurrent network is the only one.
-        model: ONNX file of another network than the shipped one; absolute in a loaded profile.
-        window_s: windows of this duration; if neither is given, the rate of events decides.
-        window_events: windows of this number of events.
-    """
-
-    method: Literal["network"] = "network"
-    model: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
-    window_s: Annotated[float, Field(ge=0.001, le=10)] | None = None
-    window_events: Annotated[int, Field(ge=1, le=1 << 26)] | None = None
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> "ReconstructionSettings":
-        what = "window_s and window_events exclude each other"
-        require(self.window_s is None or self.window_events is None, what, "window_events")
-        return self
-
-
 class ChannelSettings(Settings):
     """One stream of a camera.
 
     Attributes:
         kind: "frames", or "events" and the images reconstructed from them.
         topic: topic of its images or events in bags.
-        reconstruction: how to reconstruct images from events; None for the shipped network.
     """
 
     kind: Literal["frames", "events"] = "frames"
     topic: TopicName | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="mid_exposure")
-    reconstruction: ReconstructionSettings | None = None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "ChannelSettings":
         what = f"{self.timestamps.reference} belongs to a LiDAR; a camera has start or mid_exposure"
         require(self.timestamps.reference in ("start", "mid_exposure"), what, "timestamps.reference")
-        is_of_kind = self.reconstruction is None or self.kind == "events"
-        require(is_of_kind, "belongs to a channel of kind events", "reconstruction")
         return self
-
-    def located(self, folder: Path) -> "ChannelSettings":
-        """Make paths absolute; relative ones start at the profile's folder."""
-        settings = self.reconstruction
-        if settings is None or settings.model is None:
-            return self
-        path = (folder / Path(settings.model).expanduser()).resolve()
-        return self.model_copy(update={"reconstruction": settings.model_copy(update={"model": str(path)})})
 
 
 class CameraSettings(Settings):

@@ -19,6 +19,7 @@ _RETIRED = {
     "max_held_out_ratio",
     "max_prior_sigmas",
     "max_spread_ratio",
+    "reconstruction",
 }
 
 # The meaning of each pattern, for errors.

@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterable
 from contextlib import suppress
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 from lce_rig.core.calibration import Provenance
@@ -98,7 +97,7 @@ def content_sha256(session: Session) -> str:
 
 
 def _profile(rig: Rig) -> dict[str, Any]:
-    """List what a result depends on in a profile; a network is known by its content."""
+    """List what a result depends on in a profile."""
     profile = rig.model_dump(
         mode="json", exclude_defaults=True, exclude={"description", "robot", "targets", "exports"}
     )
@@ -108,13 +107,6 @@ def _profile(rig: Rig) -> dict[str, Any]:
             sensor.pop("serial", None)
     for key in ("device", "baud"):
         profile.get("sync", {}).pop(key, None)
-    for camera in profile.get("cameras", {}).values():
-        for channel in camera.get("channels", {}).values():
-            settings = channel.get("reconstruction") or {}
-            if settings.get("model"):
-                path, settings["model"] = Path(settings["model"]), "unreadable"
-                with suppress(OSError):
-                    settings["model"] = hashlib.sha256(path.read_bytes()).hexdigest()
     return profile
 
 

@@ -10,7 +10,8 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.events.search import find_event_board, reconstructor_for
+from lce_rig.detect.events.reconstructor import Reconstructor
+from lce_rig.detect.events.search import find_event_board
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.session import Session
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
@@ -106,7 +107,7 @@ def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_p
     seen = find_event_board(
         capture.events("davis"),
         middle_ns,
-        reconstructor_for(None, "events"),
+        Reconstructor(),
         rig.board.to_board(),
         rig.cameras["davis"].to_intrinsics(),
         rig.quality,

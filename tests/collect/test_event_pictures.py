@@ -8,11 +8,9 @@ import pytest
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Losses
-from lce_rig.detect.events.search import reconstructor_for
+from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.io.joining import merge_by_time
-from lce_rig.rig import ReconstructionSettings, load_rig
-from tests.detect.onnx_file import write_network
-from tests.shared import changed
+from lce_rig.rig import load_rig
 
 from .event_sightings import T0_NS, event_stream
 
@@ -20,16 +18,8 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    """A network that takes the mean of its bins, which is quick; it settles in 0.36 s."""
-    voxels, image = ("v", [1, 5, "height", "width"]), [1, 1, "height", "width"]
-    path = write_network(tmp_path_factory.mktemp("network") / "mean.onnx", [voxels], [image])
-    return ReconstructionSettings(model=str(path), window_s=0.03)
-
-
-@pytest.fixture(scope="module")
-def rig(quick):
-    return changed(load_rig("rles"), cameras__davis__channels__events__reconstruction=quick)
+def rig():
+    return load_rig("rles")
 
 
 def scan(time_ms):
@@ -40,7 +30,7 @@ def scan(time_ms):
 
 
 EVENTS = event_stream([(0.0, 2.0, 0.5)])
-MIDDLES_MS = range(450, 1950, 100)
+MIDDLES_MS = range(750, 1950, 100)
 
 
 def pictures(samples, rig, tally=None):
@@ -48,13 +38,13 @@ def pictures(samples, rig, tally=None):
     return [sample for sample in found if isinstance(sample, Image)]
 
 
-def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(rig, quick):
+def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(rig):
     given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
     passed = list(with_event_pictures(given, rig, ["davis"], Losses()))
     assert [s for s in passed if not isinstance(s, Image)] == given
     found = [s for s in passed if isinstance(s, Image)]
     stamps_ns = [T0_NS + t * MS for t in MIDDLES_MS]
-    truth = list(reconstructor_for(quick, "events").reconstruct(EVENTS, stamps_ns))
+    truth = list(Reconstructor().reconstruct(EVENTS, stamps_ns))
     assert [(i.sensor, i.channel, i.stamp_ns) for i in found] == [("davis", "events", t) for t in stamps_ns]
     for image, other in zip(found, truth, strict=True):
         assert isinstance(other, Image) and np.array_equal(image.pixels, other.pixels)
@@ -77,11 +67,11 @@ def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig, late
 
 def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig):
     tally = Losses()
-    scans = [scan(t) for t in range(-2950, 500, 100)]
+    scans = [scan(t) for t in range(-2950, 800, 100)]
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
-    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (450,)]
+    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (750,)]
     counts = {refusal.code: n for refusal, n in tally.counts()}
-    assert counts == {"read.events_not_begun": 30, "read.network_settling": 4}
+    assert counts == {"read.events_not_begun": 30, "read.network_settling": 7}
 
 
 def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig):

@@ -20,12 +20,12 @@ from moving_board import (
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
-from lce_rig.core.errors import ProfileError
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.events.search import TRACK_NS, find_event_board, reconstructor_for
+from lce_rig.detect.events.reconstructor import Reconstructor
+from lce_rig.detect.events.search import TRACK_NS, find_event_board
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.limits_met import gate_event_board
-from lce_rig.rig import QualitySettings, ReconstructionSettings
+from lce_rig.rig import QualitySettings
 
 MS = 1_000_000
 SQUARE_M, DEPTH_M = 0.07, 1.0
@@ -49,9 +49,7 @@ def detection(stream):
 
 
 def find(events, stamp_ns=STAMP, limits=LIMITS, **more):
-    return find_event_board(
-        events, stamp_ns, reconstructor_for(None, "events"), BOARD, CAMERA, limits, **more
-    )
+    return find_event_board(events, stamp_ns, Reconstructor(), BOARD, CAMERA, limits, **more)
 
 
 def truth_m(stamp_ns):
@@ -148,12 +146,3 @@ def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code,
 def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):
     bare = find_image_board(detection.picture, BOARD, CAMERA, limits=LIMITS, is_from_events=True)
     assert gate_event_board(bare, LIMITS) is bare
-
-
-def test_the_profile_says_how_pictures_are_made(tmp_path):
-    by_count = reconstructor_for(ReconstructionSettings(window_events=5_000), "dvs")
-    assert (by_count.windows, by_count.channel) == ((None, 5_000), "dvs")
-    by_time = reconstructor_for(ReconstructionSettings(window_s=0.03), "dvs")
-    assert by_time.windows == (0.03, None)
-    with pytest.raises(ProfileError):
-        reconstructor_for(ReconstructionSettings(model=str(tmp_path / "gone.onnx")), "dvs")

@@ -9,12 +9,10 @@ import pytest
 
 from lce_rig.core.data import Image
 from lce_rig.detect.events.reconstructor import Reconstructor
-from lce_rig.detect.events.windows import WindowOptions
 from lce_rig.io.events import open_events
 
 N_COLS, N_TAGS = 4, 12
 WINDOW_EVENTS = 18_000
-BY_COUNT = WindowOptions(n_events=WINDOW_EVENTS)
 # Tag 0 is at the lower left of the board, ids grow to the right and upwards; the first corner that OpenCV
 # gives of these tags is the lower right one. In units of a tag's side, y up.
 TAG = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
@@ -57,7 +55,7 @@ def whole(recording):
 def judged(events):
     """Judge the last half of the pictures of 18,000 events each: tags a picture, residuals."""
     stamps = [int(events.t_ns[k - 1]) + 1 for k in range(WINDOW_EVENTS, len(events) + 1, WINDOW_EVENTS)]
-    reconstructor = Reconstructor(windows=BY_COUNT)
+    reconstructor = Reconstructor()
     pictures = list(reconstructor.reconstruct([events], stamps))
     found = [tags(picture.grey) for picture in pictures[len(pictures) // 2 :]]
     residuals = [homography_residual_px(one) for one in found if len(one) >= 4]
@@ -70,10 +68,9 @@ def test_nearly_all_tags_are_read_and_their_corners_lie_on_a_plane(recording):
     assert np.mean(residuals) <= 1.32
 
 
-@pytest.mark.parametrize("windows", [WindowOptions(), WindowOptions(0.05), BY_COUNT])
-def test_tags_are_read_at_the_stamps_of_a_lidar_too(recording, windows):
+def test_tags_are_read_at_the_stamps_of_a_lidar_too(recording):
     last_ns = recording.span_ns[1]
     stamps = range(last_ns - 200_000_000, last_ns + 1, 50_000_000)
-    pictures = list(Reconstructor(windows=windows).reconstruct(recording, list(stamps)))
+    pictures = list(Reconstructor().reconstruct(recording, list(stamps)))
     assert all(isinstance(picture, Image) for picture in pictures)
     assert np.mean([len(tags(picture.grey)) for picture in pictures]) >= 11

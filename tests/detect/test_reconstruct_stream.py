@@ -11,14 +11,12 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.events.reconstructor import Reconstructor
-from lce_rig.detect.events.windows import WindowOptions
 
 MS = 1_000_000
 DURATION_S = 1.6
 STAMPS = [round((0.9 + 0.07 * k) * 1e9) for k in range(10)]
 STEADY = Motion()
 PAUSE = Motion(pause_s=1.0)
-AUTO, BY_TIME, BY_COUNT = WindowOptions(), WindowOptions(0.05), WindowOptions(n_events=6720)
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +33,14 @@ def corner_rms_px(image, truth_px):
     return min(np.sqrt(np.square(corners - order).sum(1).mean()) for order in (truth_px, truth_px[::-1]))
 
 
-def errors_px(events, windows, motion=STEADY, stamps=STAMPS):
-    pictures = Reconstructor(windows=windows).reconstruct([events], stamps)
+def errors_px(events, motion=STEADY, stamps=STAMPS):
+    pictures = Reconstructor().reconstruct([events], stamps)
     truth = [inner_corners_px(motion, stamp / 1e9) for stamp in stamps]
     return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
 
 
-@pytest.mark.parametrize("windows", [AUTO, BY_TIME, BY_COUNT])
-def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, windows):
-    errors = errors_px(stream, windows)
+def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream):
+    errors = errors_px(stream)
     assert np.isfinite(errors).mean() >= 0.9
     assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
 
@@ -51,7 +48,7 @@ def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, windows):
 def test_the_picture_lasts_while_the_board_stands_still():
     events = board_events(PAUSE, DURATION_S)
     stamps = [1_200 * MS, 1_500 * MS]
-    errors = errors_px(events, WindowOptions(), PAUSE, stamps)
+    errors = errors_px(events, PAUSE, stamps)
     assert (errors < 1.0).all()
 
 
@@ -91,12 +88,11 @@ def test_events_of_another_resolution_and_ones_that_go_back_in_time_are_an_error
             list(Reconstructor().reconstruct(batches, [9_000 * MS]))
 
 
-@pytest.mark.parametrize("windows", [AUTO, BY_TIME])
-def test_an_hour_of_silence_costs_no_hour_of_steps(stream, windows):
+def test_an_hour_of_silence_costs_no_hour_of_steps(stream):
     first, rest = stream.between(0, 800 * MS), stream.between(800 * MS, 10_000 * MS)
     hour_ns = 3_600 * 1_000 * MS
     later = replace(rest, t_ns=rest.t_ns + hour_ns)
-    reconstructor = Reconstructor(windows=windows)
+    reconstructor = Reconstructor()
     answers = list(reconstructor.reconstruct([first, later], [hour_ns + 1_500 * MS]))
     assert isinstance(answers[0], Image)
     assert reconstructor.n_steps < 100
@@ -115,5 +111,5 @@ def test_flickering_lamps_do_not_blind_the_network_for_good(stream):
         np.concatenate(pair)
         for pair in zip(*((e.t_ns, e.x, e.y, e.polarity) for e in (stream, storm)), strict=True)
     ]
-    errors = errors_px(events_of(*parts), WindowOptions(), stamps=[1_300 * MS, 1_500 * MS])
+    errors = errors_px(events_of(*parts), stamps=[1_300 * MS, 1_500 * MS])
     assert (errors < 1.0).all()

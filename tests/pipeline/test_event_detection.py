@@ -1,14 +1,12 @@
 """Raw events of a capture are seen through pictures for the LiDAR's time on the board, made once."""
 
 from dataclasses import replace
-from importlib import resources
 
 import numpy as np
 import pytest
 
 import lce_rig as lce
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline.detect_session import event_picture, picture_stamp_ns
@@ -129,40 +127,3 @@ def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):
     path.write_bytes(path.read_bytes()[:-100])
     board = found_in(session)
     assert board.code == "read.error" and "damaged" in board.figures["what"]
-
-
-def with_network(path):
-    return PROFILE.replace("{kind: events,", f"{{kind: events, reconstruction: {{model: {path}}},")
-
-
-def shipped_network():
-    return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-
-
-def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(tmp_path, stream):
-    (tmp_path / "mine.onnx").write_bytes(shipped_network())
-    (tmp_path / "mine.yaml").write_text(with_network("mine.onnx"), encoding="utf-8")
-    rig = load_rig(tmp_path / "mine.yaml")
-    with Session.create(tmp_path / "session", rig) as session:
-        session.add_capture([], [bare_scan()], {}, [stream])
-    # Opened anew: the profile frozen in the session leads to the file.
-    assert isinstance(found_in(Session.open(tmp_path / "session")), ImageBoard)
-    n_before = len(list((tmp_path / "session" / "detections").rglob("*.picture.npz")))
-    # Another file under the same name is another network: here one whose first weights differ.
-    changed = bytearray(shipped_network())
-    middle = len(changed) // 2
-    changed[middle : middle + 4000] = bytes(4000)
-    (tmp_path / "mine.onnx").write_bytes(bytes(changed))
-    lce.detect(Session.open(tmp_path / "session"))
-    assert len(list((tmp_path / "session" / "detections").rglob("*.picture.npz"))) == n_before + 1
-
-
-@pytest.mark.parametrize("content", [None, b"heightX2", b""])
-def test_a_network_that_cannot_be_used_is_named(tmp_path, stream, content):
-    path = tmp_path / "mine.onnx"
-    if content is not None:
-        path.write_bytes(shipped_network().replace(b"height_2", content) if content else b"")
-    session = session_of(tmp_path, stream, with_network(str(path)))
-    with pytest.raises(ProfileError) as raised:
-        found_in(session)
-    assert "mine.onnx" in raised.value.what

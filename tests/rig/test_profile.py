@@ -206,41 +206,6 @@ sync:
 """
 
 
-def with_block(block, kind=KIND):
-    return RLES.replace(kind, f"{kind}        reconstruction: {block}\n", 1)
-
-
-@pytest.mark.parametrize("path", ["nets/other.onnx", "/nets/other.onnx"])
-def test_the_path_of_a_network_begins_at_the_profiles_folder_and_stays_absolute_in_a_session(tmp_path, path):
-    (tmp_path / "mine.yaml").write_text(with_block(f"{{model: {path}}}"), encoding="utf-8")
-    rig = load_rig(tmp_path / "mine.yaml")
-    settings = rig.cameras["davis"].channels["events"].reconstruction
-    assert settings is not None and settings.model == str(tmp_path / path)
-    frozen = tmp_path / "elsewhere" / "rig.yaml"
-    frozen.parent.mkdir()
-    frozen.write_text(dump_rig(rig), encoding="utf-8")
-    assert load_rig(frozen) == rig
-
-
-@pytest.mark.parametrize(
-    ("block", "key"),
-    [
-        ("{window_s: 0.05, window_events: 100}", "window_events"),
-        ("{windows_s: 0.05}", "windows_s"),
-        ("{window_s: 50}", "window_s"),
-        ("{window_events: 0}", "window_events"),
-        ("{method: map}", "method"),
-        ("{model: ''}", "model"),
-    ],
-)
-def test_a_reconstruction_that_cannot_be_meant_is_named_with_its_line(block, key):
-    text = with_block(block)
-    line = text[: text.index("reconstruction:")].count("\n") + 1
-    with pytest.raises(ProfileError) as caught:
-        parse_rig(text, "mine.yaml")
-    assert f"mine.yaml:{line}:" in str(caught.value) and f"events.reconstruction.{key}:" in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [

@@ -4,7 +4,6 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, join_events
-from lce_rig.core.errors import ProfileError, SourceError, UsageError, reason_of
+from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.interrupts import without_interrupt
 from lce_rig.detect.events.noise import NoiseFilter
 from lce_rig.detect.events.windows import (
     FloatArray,
-    WindowOptions,
     WindowRule,
     active_share,
     normalise_voxels,
@@ -34,11 +32,7 @@ from lce_rig.detect.findings import (
 
 States = tuple[FloatArray, ...]
 
-_EXPECTED = (
-    "expected the inputs voxels (1, bins, height, width) and states (1, channels, height_2, width_2) with "
-    "height_2 meaning half of the height and so on, and the outputs image (1, 1, height, width) and the "
-    "next states in the same order; docs/model-card.md says how to export such a file"
-)
+SHIPPED_NETWORK = Path(__file__).parents[2] / "models" / "reconstruction.onnx"
 
 
 class StateSpec(NamedTuple):
@@ -49,19 +43,16 @@ class StateSpec(NamedTuple):
 
 
 class ReconstructionModel:
-    """A recurrent event-to-image network in ONNX, its state explicit.
+    """The recurrent event-to-image network in ONNX, its state explicit.
 
     Args:
-        path: ONNX file; None for the one shipped with the package.
+        path: ONNX file of the network.
 
     Raises:
-        ProfileError: the file cannot be loaded, or has other inputs or outputs than expected.
         SourceError: onnxruntime is not installed.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
-        self.name = "the shipped model" if path is None else str(path)
-        content = model_bytes(path)
+    def __init__(self, path: Path = SHIPPED_NETWORK) -> None:
         try:
             with without_interrupt():
                 import onnxruntime
@@ -71,38 +62,24 @@ class ReconstructionModel:
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.log_severity_level = 4
-        try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime raises classes of its own, one for each status
-            raise self._refused(f"cannot be loaded: {reason_of(error)}") from error
+        providers = ["CPUExecutionProvider"]
+        self._session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=providers)
         voxels, *states = self._session.get_inputs()
-        try:
-            # (1, bins, "height", "width"), and (1, channels, "height_2", "width_2") of a state at half size.
-            self.n_bins = int(voxels.shape[1])
-            divisors = [int(state.shape[2].partition("_")[2] or 1) for state in states]
-            self.states = tuple(
-                StateSpec(int(state.shape[1]), n) for state, n in zip(states, divisors, strict=True)
-            )
-        except (ValueError, TypeError, IndexError, AttributeError):
-            shapes = [item.shape for item in (voxels, *states)]
-            raise self._refused(f"its inputs have the shapes {shapes}") from None
+        # (1, bins, "height", "width"), and (1, channels, "height_2", "width_2") of a state at half size.
+        self.n_bins = int(voxels.shape[1])
+        self.states = tuple(
+            StateSpec(int(state.shape[1]), int(state.shape[2].partition("_")[2] or 1)) for state in states
+        )
         # The image is padded so that every state has a whole number of rows and columns.
         self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
 
     def initial_states(self, height_px: int, width_px: int) -> States:
-        """Make the states before the first window for a sensor of this size: zeros.
-
-        Raises:
-            ProfileError: they do not fit into memory.
-        """
+        """Make the states before the first window for a sensor of this size: zeros."""
         height, width = self._padded(height_px), self._padded(width_px)
-        try:
-            return tuple(
-                np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
-                for spec in self.states
-            )
-        except (MemoryError, ValueError) as error:  # ValueError: beyond what an array can hold
-            raise self._refused("its states do not fit into memory") from error
+        return tuple(
+            np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
+            for spec in self.states
+        )
 
     def step(self, voxels: FloatArray, states: States) -> tuple[FloatArray, States]:
         """Reconstruct one window.
@@ -117,38 +94,13 @@ class ReconstructionModel:
         _, height, width = voxels.shape
         rows, cols = self._padded(height) - height, self._padded(width) - width
         names = (item.name for item in self._session.get_inputs())
-        try:
-            grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
-            outputs = self._session.run(None, dict(zip(names, (grid, *states), strict=True)))
-        except Exception as error:  # see __init__
-            raise self._refused(f"a step of {width} x {height} px fails: {reason_of(error)}") from error
-        expected = [(1, 1, height + rows, width + cols), *(state.shape for state in states)]
-        shapes = [getattr(array, "shape", None) for array in outputs]
-        if shapes != expected:
-            raise self._refused(f"its outputs have the shapes {shapes}, not {expected}")
+        grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
+        outputs = self._session.run(None, dict(zip(names, (grid, *states), strict=True)))
         image, *following = (np.asarray(array, np.float32) for array in outputs)
         return image[0, 0, :height, :width], tuple(following)
 
     def _padded(self, size_px: int) -> int:
         return -(-size_px // self.size_multiple) * self.size_multiple
-
-    def _refused(self, what: str) -> ProfileError:
-        return ProfileError(f"reconstruction model {self.name}: {what}", _EXPECTED)
-
-
-def model_bytes(path: Path | None) -> bytes:
-    """Read a network's file; None takes the one shipped with the package.
-
-    Raises:
-        ProfileError: there is no such file, or it cannot be read.
-    """
-    if path is None:
-        return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-    try:
-        return path.read_bytes()
-    except (OSError, MemoryError) as error:
-        hint = "Omit the key to use the shipped one."
-        raise ProfileError(f"reconstruction model {path}: {reason_of(error)}", hint) from error
 
 
 # From the network's arbitrary scale to 8 bits, without flicker.
@@ -213,20 +165,15 @@ class Reconstructor:
     with the events up to the timestamp.
 
     Args:
-        model: ONNX file; None takes the one shipped with the package.
-        windows: how the stream is cut.
         channel: the channel of the images.
 
     Raises:
-        ProfileError: the model cannot be used.
         SourceError: onnxruntime is not installed.
     """
 
-    def __init__(
-        self, model: Path | None = None, windows: WindowOptions | None = None, channel: str = "events"
-    ) -> None:
-        self.windows, self.channel = windows or WindowOptions(), channel
-        self._model = ReconstructionModel(model)
+    def __init__(self, channel: str = "events") -> None:
+        self.channel = channel
+        self._model = ReconstructionModel()
         self.reset()
 
     def reset(self) -> None:
@@ -334,7 +281,7 @@ class Reconstructor:
     def _rule(self) -> WindowRule:
         assert self._current is not None
         events = self._current.events
-        return window_rule(self.windows, events.height_px, events.width_px, self._share)
+        return window_rule(events.height_px, events.width_px, self._share)
 
     def _advance(self, until_ns: int) -> None:
         """Take every step whose window is complete by then."""

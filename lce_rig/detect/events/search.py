@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -15,10 +14,9 @@ from lce_rig.core.planar_pose import pose_covariance
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
 from lce_rig.detect.events.reconstructor import Reconstructor
-from lce_rig.detect.events.windows import WindowOptions
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.limits_met import explain_missing_board, gate_event_board, gate_image_board
-from lce_rig.rig import QualitySettings, ReconstructionSettings
+from lce_rig.rig import QualitySettings
 
 # One order of corners, and one of the two poses, for all images of the same board.
 
@@ -117,22 +115,6 @@ class EventSighting:
     board: ImageBoard | Refusal
 
 
-def reconstructor_for(settings: ReconstructionSettings | None, channel: str) -> Reconstructor:
-    """Set up a reconstructor according to a profile.
-
-    Args:
-        settings: the channel's block; None for the shipped network and automatic windows.
-        channel: the channel of the images.
-
-    Raises:
-        ProfileError: the network cannot be used.
-        SourceError: onnxruntime is not installed.
-    """
-    settings = settings or ReconstructionSettings()
-    model = None if settings.model is None else Path(settings.model)
-    return Reconstructor(model, WindowOptions(settings.window_s, settings.window_events), channel)
-
-
 def find_event_board(
     events: Events,
     stamp_ns: int,
@@ -155,7 +137,7 @@ def find_event_board(
         sweep_s: how long the LiDAR sees the board; None if it does not.
 
     Raises:
-        ProfileError: the intrinsics or the network are for images of another size.
+        ProfileError: the intrinsics are for images of another size.
     """
     last_ns = int(events.t_ns[-1]) if len(events) else stamp_ns
     about = {min(stamp_ns + offset, max(last_ns, stamp_ns)) for offset in TRACK_NS}

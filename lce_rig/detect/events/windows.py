@@ -14,62 +14,39 @@ _BLOCK_PX = 16
 # Share of the sensor that takes part in a usual scene with the camera moving; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
-_AUTO_LONGEST_NS = 60_000_000
-_AUTO_SHORTEST_NS = 20_000_000
-_FOREVER_NS = 1 << 62
-
-
-class WindowOptions(NamedTuple):
-    """How the stream is cut into windows.
-
-    By default they hold as many events as the active part of the sensor calls for, but last 20 to 60 ms.
-
-    Attributes:
-        duration_s: of each window instead; the paper used 0.05 s.
-        n_events: in each window instead.
-    """
-
-    duration_s: float | None = None
-    n_events: int | None = None
+_LONGEST_NS = 60_000_000
+_SHORTEST_NS = 20_000_000
 
 
 class WindowRule(NamedTuple):
-    """When the current window ends: at n_events and shortest_ns both, or at longest_ns."""
+    """When the current window ends: at n_events and 20 ms both, or at 60 ms."""
 
     n_events: int
-    shortest_ns: int
-    longest_ns: int
 
     def fill(self, n_events: int, age_ns: int) -> float:
         """Return how full a window is, 1 where it ends."""
-        by_count = min(n_events / self.n_events, age_ns / self.shortest_ns if self.shortest_ns else np.inf)
-        return max(by_count, age_ns / self.longest_ns)
+        return max(min(n_events / self.n_events, age_ns / _SHORTEST_NS), age_ns / _LONGEST_NS)
 
     def end(self, events: Events, start_ns: int) -> int | None:
         """Find where the window ends that began at start_ns with the first of `events`, ns; None if not yet.
 
         The window is [start, end): the event that completes the count still belongs to it.
         """
-        longest_end = start_ns + self.longest_ns
+        longest_end = start_ns + _LONGEST_NS
         ends = [longest_end] if len(events) and int(events.t_ns[-1]) >= longest_end else []
         if len(events) >= self.n_events:
-            filled = max(int(events.t_ns[self.n_events - 1]) + 1, start_ns + self.shortest_ns)
+            filled = max(int(events.t_ns[self.n_events - 1]) + 1, start_ns + _SHORTEST_NS)
             # Equal timestamps may go on in events yet to come: wait for a later one.
             if int(events.t_ns[-1]) >= filled:
                 ends.append(filled)
         return min(ends, default=None)
 
 
-def window_rule(options: WindowOptions, height_px: int, width_px: int, share: float) -> WindowRule:
-    """Settle the next window's end from the options and the share of the sensor that is active."""
-    if options.duration_s is not None:
-        duration_ns = max(1, round(options.duration_s * 1e9))
-        return WindowRule(1 << 62, 0, duration_ns)
-    if options.n_events is not None:
-        return WindowRule(options.n_events, 0, _FOREVER_NS)
+def window_rule(height_px: int, width_px: int, share: float) -> WindowRule:
+    """Settle the next window's end from the share of the sensor that is active."""
     usual = _EVENTS_PER_PIXEL * height_px * width_px
     relative = min(1.0, max(share, _MIN_ACTIVE_SHARE) / _USUAL_ACTIVE_SHARE)
-    return WindowRule(max(1, round(usual * relative)), _AUTO_SHORTEST_NS, _AUTO_LONGEST_NS)
+    return WindowRule(max(1, round(usual * relative)))
 
 
 def active_share(events: Events) -> float:
