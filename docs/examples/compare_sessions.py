@@ -1,4 +1,4 @@
-"""Compare the calibrations of two independent sessions; check one result on the captures of the other.
+"""Compare the results of two independent sessions; check one result on the captures of the other.
 
 python compare_sessions.py SESSION SESSION
 """
@@ -16,7 +16,7 @@ def main(first: str, second: str) -> None:
         for two in comparison.differences:
             apart = f"{two.rotation_deg:.3f} deg, {1000 * two.translation_m:.1f} mm"
             print(f"  {two.first} and {two.second}: {apart} (probability {two.p:.2f})")
-    result = lce.calibrate(lce.Session.open(first))
+    result = lce.read_result(f"{first}/calibration/result.json")
     verification = lce.verify(lce.Session.open(second), result)
     for check in verification.checks:
         doubts = "; ".join(finding.text for finding in check.findings)

@@ -1,7 +1,7 @@
-"""`lce-rig captures` and `lce-rig results`: the captures and the results that a session holds."""
+"""`lce-rig captures`, `results` and `repeat`: what sessions hold, and whether their results agree."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
@@ -11,9 +11,13 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option, path_option, session_argument
+from lce_rig.cli.options import explain_option, json_option, path_option, session_argument
 from lce_rig.core.calibration import Calibration
-from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.phrasing import as_line, significant, sizes
+from lce_rig.judge.repeatability import Repeatability
+from lce_rig.pipeline.comparison import compare_results
+from lce_rig.pipeline.comparison import repeat as compare
 from lce_rig.pipeline.result_files import CURRENT, RESULT, StoredResult, stored_results
 from lce_rig.session import Session
 
@@ -228,3 +232,74 @@ def _tables(stored: list[StoredResult]) -> list[Any]:
         show.plain_table(show.escape(sensors), *(headings if sensors else ("result", "")), rows=cells)
         for sensors, cells in rows.items()
     ]
+
+
+@click.command()
+@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="SESSION...")
+@click.option(
+    "--name",
+    "names",
+    metavar="NAME",
+    multiple=True,
+    help="Compare this named result (see `lce-rig results`); repeatable with one session.",
+)
+@explain_option
+@json_option
+def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as_json: bool) -> None:
+    """Compare the calibrations of two or more independent SESSIONs of one rig, or the results of one SESSION.
+
+    The best test of extrinsics: collect again with new placements of the board. Errors that all sessions
+    share stay hidden: intrinsics, the board's size, constant range errors.
+
+    With one session, compare the results of `lce-rig calibrate SESSION --name NAME` with the current one.
+
+    Exits with 7 if the calibrations disagree, or if one of them failed.
+    """
+    if len(sessions) == 1:
+        compared = compare_results(sessions[0], names)
+    elif len(names) > 1:
+        raise UsageError("several results and several sessions given", "Give one session, or one result.")
+    else:
+        compared = compare(sessions, name=next(iter(names), None))
+    show.warn_of(finding for finding in compared.findings if finding.severity != "error")
+    document = {
+        "format_version": 2,
+        "rig": compared.rig,
+        "findings": compared.findings,
+        "pairs": [
+            {name.replace("reported_", "claimed_"): v for name, v in vars(c).items() if name != "names"}
+            | {"sessions": c.names, "agrees": c.agrees, "finding": c.finding}
+            for c in compared.comparisons
+        ],
+    }
+    if as_json:
+        show.print_json(document)
+    else:
+        for comparison in compared.comparisons:
+            show.print_parts(_agreement(comparison, str(sessions[0])))
+    if explain and not as_json:
+        show.print_figures(document)
+    if compared.failed:
+        raise ResultRefusedError(
+            "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
+        )
+    refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
+    if refused:
+        names_of = ", ".join(f"{c.camera} and {c.lidar}" for c in refused)
+        raise ResultRefusedError(f"the sessions disagree on the extrinsics of {names_of}")
+
+
+def _agreement(c: Repeatability, session: str) -> Iterator[str]:
+    """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
+    shared = "" if c.are_independent else ", at least: the results share captures"
+    colour = "green" if c.agrees else "red"
+    yield f"[{colour}]{show.escape(c.finding.text)}[/]"
+    if advice := c.finding.advice_at(session):
+        yield f"  -> {show.escape(as_line(advice))}"
+    yield "  mean T_cam_lidar (p_cam = R p_lidar + t)"
+    yield from show.matrix_lines(c.T_cam_lidar, "    ")
+    spread = sizes(c.spread_rotation_deg, c.spread_translation_m)
+    yield f"  spread       {spread} (1 sigma of one session)"
+    yield f"  reported     {sizes(c.reported_rotation_deg, c.reported_translation_m)}"
+    chance = significant(max(c.p, 1e-300))  # "below ...", as no chance is 0
+    yield f"  chance       {chance}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)"

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -77,12 +76,15 @@ def drift(
     for text in report.notes:
         show.note(text)
     files = [] if output is None else report.write(output)
+    pairs = [pair.document() for pair in report.pairs]
+    document = {"format_version": 1, "rig": report.rig.name, "pairs": pairs}
     if as_json:
-        pairs = [pair.document() for pair in report.pairs]
-        show.print_json({"format_version": 1, "rig": report.rig.name, "pairs": pairs})
+        show.print_json(document)
     else:
         for pair in report.pairs:
-            show.print_parts(_parts(pair, is_explained=explain))
+            show.print_parts(_parts(pair))
+        if explain:
+            show.print_figures(document)
         for file in files:
             show.say(f"image: {file}")
     outcomes: dict[State, type[LceRigError]] = {"changed": ResultRefusedError, "unknown": NotEnoughDataError}
@@ -136,10 +138,8 @@ def _sensors(pair: PairDrift) -> str:
     return f"{pair.calibration.camera}, {pair.calibration.lidar}"
 
 
-def _parts(pair: PairDrift, *, is_explained: bool) -> Iterator[Any]:
+def _parts(pair: PairDrift) -> Iterator[str]:
     """State the verdict, the axes by their state, further causes, and one action."""
-    if is_explained:
-        yield _table(pair)
     data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     data += "" if pair.board is None else f", {show.counted(pair.board.n_boards, 'board')}"
     yield f"[bold]{_sensors(pair)}[/]: [{_COLOURS[pair.state]}]{STATES[pair.state]}[/] ({data})"
@@ -153,16 +153,12 @@ def _parts(pair: PairDrift, *, is_explained: bool) -> Iterator[Any]:
                 if each.state == state
             }
             yield from show.titled_lines(title, show.axes_by_kind(figures))
-    if pair.board is not None and is_explained:
-        metrics, n_placements = pair.board.metrics, pair.board.n_placements
-        residuals = f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm"
-        yield f"  boards at {n_placements} places, residuals: {residuals}"
     # With a board, the verdict on both stands for the scene's own.
     omitted = {pair.summary.code, *(_OF_SCENE if pair.board is not None else ())}
     for finding in pair.findings:
         if finding.code in omitted and finding.code != "scene.few_edges":
             continue
-        if is_explained or (finding.severity != "note" and finding.code not in _OF_AXES):
+        if finding.severity != "note" and finding.code not in _OF_AXES:
             yield f"  {show.escape(as_line(finding.text))}"
     if pair.summary.advice:
         yield f"  -> {show.escape(as_line(pair.summary.advice))}"
@@ -177,23 +173,6 @@ def _opinion(pair: PairDrift, index: int) -> AxisDrift:
     deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
     best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
     return replace(best, state=state)
-
-
-def _table(pair: PairDrift) -> Any:
-    """List the axes with what the scene and the boards measured."""
-    opinions = {"scene": pair.drift.axes if pair.drift.curves else None}
-    opinions |= {} if pair.board is None else {"board": pair.board.axes}
-    # With two opinions, all fits into 80 columns.
-    headings = [heading for name in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")]
-    rows = []
-    for index, axis in enumerate(pair.drift.axes):
-        name = f"about {axis.axis[-1]}, deg" if axis.unit == "deg" else f"along {axis.axis[-1]}, mm"
-        state = pair.states[axis.axis]
-        colour = "none" if state == "unchanged" else _COLOURS[state]
-        figures = [text for axes in opinions.values() for text in _figures(axes[index] if axes else None)]
-        rows.append((name, f"[{colour}]{STATES[state]}[/]", *figures))
-    title = f"{_sensors(pair)} (camera: x right, y down, z forward)"
-    return show.plain_table(title, "axis of\nthe camera", "", *headings, rows=rows)
 
 
 def _figures(axis: AxisDrift | None) -> tuple[str, str]:

@@ -19,7 +19,6 @@ from lce_rig.cli.options import (
 )
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.phrasing import as_line
-from lce_rig.judge.intrinsics_check import describe as figures_of
 from lce_rig.pipeline.camera_intrinsics import (
     MeasuredIntrinsics,
     document,
@@ -87,14 +86,16 @@ def intrinsics(
     if not measured:
         raise troubles[0]
     files = write_intrinsics(opened, measured)
+    described = document(opened.rig, measured)
     if as_json:
-        show.print_json(document(opened.rig, measured))
+        show.print_json(described)
     else:
         for one in measured:
             is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
             advice = "" if is_followed else one.judgement.advice_at(str(session))
-            whole = "" if explain else show.command("intrinsics", session, " --explain")
-            show.print_parts(_parts(one, advice, whole))
+            show.print_parts(_parts(one, advice, show.command("intrinsics", session, " --explain")))
+    if explain and not as_json:
+        show.print_figures(described)
     show.note(f"  files        {files[0].parent}/: {', '.join(path.name for path in files)}")
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
@@ -108,13 +109,13 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[Any]:
+def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[str]:
     """State the judgement with its action, the fit, the intrinsics and the weakness that matters most.
 
     Args:
         measured: of one camera.
         advice: the action, or "".
-        whole: the command that explains all; "" if it is this one.
+        whole: the command that explains all.
     """
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
@@ -130,55 +131,11 @@ def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[An
     yield f"  corners      {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out ones"
     values = (f"{name} {getattr(lens, f'{name}_px'):.1f}" for name in ("fx", "fy", "cx", "cy"))
     yield f"  values       {', '.join(values)} px"
-    weaknesses = [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
-    if not whole:
-        yield _table(measured)
-        yield from _explanation(measured)
-        yield from weaknesses
-        for name, why in measured.refused.items():
-            yield f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]"
-    elif judgement.code != "intrinsics.fit":
-        told = zip(measured.weaknesses, weaknesses, strict=True)
-        weaknesses = [line for text, line in told if text not in judgement.sentence]
-        yield from weaknesses[:1]
+    if judgement.code != "intrinsics.fit":
+        weaknesses = [text for text in measured.weaknesses if text not in judgement.sentence]
+        yield from (f"  [yellow]{show.escape(text)}[/]" for text in weaknesses[:1])
         if len(weaknesses) > 1:
             yield f"  {len(weaknesses) - 1} more: {whole}"
-
-
-def _table(measured: MeasuredIntrinsics) -> Any:
-    """List the parameters, with the profile's if model and resolution are the same."""
-    estimate, lens = measured.estimate, measured.given
-    values = estimate.model.vector(measured.intrinsics)
-    try:
-        old = None if measured.check is None else estimate.model.vector(lens)
-    except ValueError:
-        old = None
-    rows = []
-    for index, name in enumerate(estimate.model.parameters):
-        digits = 2 if name.endswith("_px") else 5
-        sigma = float(estimate.sigma[index])
-        cells = [f"{values[index]:.{digits}f}", f"{sigma:.{digits}f}", "-", "-"]
-        if old is not None:
-            cells[2:] = f"{old[index]:.{digits}f}", f"{(values[index] - old[index]) / sigma:+.1f} sigma"
-        rows.append(("  " + name.removesuffix("_px"), *cells))
-    return show.plain_table("", "", ">measured", ">sigma", ">profile", ">difference", rows=rows)
-
-
-def _explanation(measured: MeasuredIntrinsics) -> Iterator[str]:
-    """State the board's shape and what does not fit."""
-    estimate = measured.estimate
-    (along_width, along_height, aspect), sigma = estimate.pattern_shape
-    # The board's deviation from its nominal shape, estimated with the intrinsics.
-    yield (
-        f"  board     bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
-        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
-        f"corner error {1000 * estimate.print_rms_m:.2f} mm"
-    )
-    if measured.check is not None:
-        yield f"  {figures_of(measured.check)}"
-    if measured.misfit is not None:
-        colour = "red" if measured.misfit.severity == "error" else "yellow"
-        yield f"  [{colour}]{show.escape(measured.misfit.text)}[/]"
 
 
 @click.command(name="lidar-intrinsics")
@@ -207,7 +164,9 @@ def lidar_intrinsics(
     if as_json:
         show.print_json(document)
     else:
-        show.print_parts(_errors(document, is_explained=explain))
+        show.print_parts(_errors(document))
+        if explain:
+            show.print_figures(document)
     if save_profile is not None:
         save_lidar(opened[0], lidar, errors, save_profile)
         show.note(f"written: {save_profile}")
@@ -221,8 +180,8 @@ _ERRORS = (
 )
 
 
-def _errors(document: dict[str, Any], *, is_explained: bool) -> Iterator[Any]:
-    """State the spread of each kind of error over the lasers, and the lens; explained, each laser's."""
+def _errors(document: dict[str, Any]) -> Iterator[str]:
+    """State the spread of each kind of error over the lasers, and the lens."""
     lasers, n_captures = document["lasers"], document["n_captures"]
     sessions = show.counted(len(n_captures), "session")
     yield f"{show.counted(sum(n_captures), 'capture')} of {sessions}, {len(lasers)} lasers"
@@ -237,18 +196,3 @@ def _errors(document: dict[str, Any], *, is_explained: bool) -> Iterator[Any]:
     ):
         value, sigma = (1000 * document[key.format(part)] for part in ("", "_sigma"))
         yield f"  {title:<13}{value:+.1f} +- {sigma:.1f} mm {where}"
-    if is_explained:
-        angles = (">azimuth deg", ">sigma", ">elevation deg", ">sigma")
-        rows = (
-            (
-                f"{row['ring']}",
-                *(
-                    f"{scale * row[each]:{sign}.{digits}f}"
-                    for _, key, sigma_key, scale, digits, _ in _ERRORS
-                    for each, sign in ((key, "+"), (sigma_key, ""))
-                ),
-                f"{row['n_points']}",
-            )
-            for row in lasers
-        )
-        yield show.plain_table("", ">laser", ">range mm", ">sigma", *angles, ">returns", rows=rows)

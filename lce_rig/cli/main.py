@@ -19,7 +19,7 @@ __all__ = ["COMMANDS", "main", "run"]
 # runs, so that `lce-rig --help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
-    "board": ("lce_rig.cli.board", "Draw a board to print at scale, with its profile block."),
+    "board": ("lce_rig.cli.rigs", "Draw a board to print at scale, with its profile block."),
     "doctor": ("lce_rig.cli.doctor", "Check whether this computer and the sensors are fit to collect."),
     "simulate": ("lce_rig.cli.simulate", "Simulate a session or recording of a rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),
@@ -35,7 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "results": ("lce_rig.cli.contents", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
     "deploy": ("lce_rig.cli.deploy", "Put a result on a robot, ask what is there, or go back."),
-    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
+    "repeat": ("lce_rig.cli.contents", "Compare the calibrations of sessions, or the results of one."),
     "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }
 EXIT_BUG = 70

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from lce_rig.core.findings import Finding
+from lce_rig.rig.loading import dump_yaml
 
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
@@ -105,7 +106,16 @@ def warn_of(findings: Iterable[Finding]) -> None:
 
 def print_json(document: Any) -> None:
     """Print a result for machines: findings, records and arrays as they are, too."""
+    click.echo(_as_json(document))
 
+
+def print_figures(document: Any) -> None:
+    """Print every figure of a result for people, as YAML of what `print_json` prints, to five digits."""
+    rounded = json.loads(_as_json(document), parse_float=lambda text: float(f"{float(text):.5g}"))
+    click.echo(dump_yaml(rounded), nl=False)
+
+
+def _as_json(document: Any) -> str:
     def plain(value: Any) -> Any:
         if hasattr(value, "as_json"):
             return value.as_json()
@@ -113,7 +123,7 @@ def print_json(document: Any) -> None:
             return value.model_dump()
         return value.tolist() if hasattr(value, "tolist") else vars(value)
 
-    click.echo(json.dumps(document, indent=2, allow_nan=False, default=plain))
+    return json.dumps(document, indent=2, allow_nan=False, default=plain)
 
 
 def plain_table(title: str, *headings: str, rows: Iterable[Iterable[str]] = ()) -> Any:

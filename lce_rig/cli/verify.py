@@ -51,18 +51,19 @@ def verify(
     show.warn_of(verification.notes)
     with show.progress_bar("drawing") as progress:
         checks = verification.write(output, progress=progress)
+    document = {
+        "format_version": 2,
+        "rig": opened.rig.name,
+        "pairs": [c.document() for c in checks],
+        "findings": verification.notes,
+    }
     if as_json:
-        show.print_json(
-            {
-                "format_version": 2,
-                "rig": opened.rig.name,
-                "pairs": [c.document() for c in checks],
-                "findings": verification.notes,
-            }
-        )
+        show.print_json(document)
     else:
         for checked in checks:
             show.print_parts(_parts(checked, str(session), is_explained=explain))
+        if explain:
+            show.print_figures(document)
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(verification.calibrations, are_printed=not as_json)
@@ -79,15 +80,6 @@ def verify(
 def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterator[Any]:
     """State whether the captures agree with the extrinsics, mean residuals and where the images are."""
     c, doubts, pair = checked.calibration, checked.findings, str(checked.pair)
-    if is_explained:
-        rows = []
-        for r in checked.residuals:
-            lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
-            state = "" if r.capture in c.captures_used else "[dim]not used[/]"
-            millimetres = (f"{1000 * value:.1f}" for value in lengths)
-            rows.append((r.capture, *millimetres, f"{r.reprojection_px:.2f}", state))
-        headings = ("capture", ">planes mm", ">rms", ">edges mm", ">rms", ">corners px", "")
-        yield show.plain_table(pair, *headings, rows=rows)
     colour = {"note": "green", "warning": "yellow", "error": "red"}[worst(doubts)]
     opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]
     of_result = show.COLOURS[c.verdict]

@@ -196,16 +196,6 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
     )
 
 
-def describe(check: IntrinsicsCheck) -> str:
-    """State the figures of a check, for any verdict."""
-    return (
-        f"profile   reprojection error {check.rms_px:.3f} px (possible {check.possible_px:.3f} px); pixels "
-        f"displaced by {check.displacement_px:.2f} +- {check.displacement_sigma_px:.2f} px, camera "
-        f"rotated by {check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg; focal length "
-        f"{100 * (check.focal_ratio - 1):+.2f} +- {100 * check.focal_sigma:.2f} %"
-    )
-
-
 def judge_lens(
     covered: float, image_sigma_px: float, check: IntrinsicsCheck | None, target_deg: float = 0.2
 ) -> Finding:

@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
-from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.core.findings import Finding
-from lce_rig.core.progress import Progress, silent
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
-from lce_rig.pipeline.calibration import calibrate
-from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BOARD, OUTDATED
-from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_folder, stored_results
+from lce_rig.pipeline.findings import FAILED, ONLY_ONE, OTHER_BOARD, OUTDATED
+from lce_rig.pipeline.result_files import PREVIOUS, RESULT, result_folder, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
 
@@ -28,13 +26,11 @@ class Repeat:
     Attributes:
         rig: its name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
-        calibrated: names of the sessions that held no result and were calibrated for this.
         findings: errors name sessions whose own calibration has failed; warnings state limits.
     """
 
     rig: str
     comparisons: tuple[Repeatability, ...]
-    calibrated: tuple[str, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -73,24 +69,20 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
     comparisons, findings = _compare_sensors(results, "results", are_independent=False)
     path = shlex.quote(str(session.path))
     outdated = [OUTDATED(name, session=path) for name in chosen if stored[name].is_outdated]
-    return Repeat(session.rig.name, comparisons, (), (*outdated, *findings))
+    return Repeat(session.rig.name, comparisons, (*outdated, *findings))
 
 
-def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
+def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     """Compare the results of independent sessions of one rig.
-
-    A session without a result is calibrated with the default options; nothing is written.
 
     Args:
         folders: of the sessions.
         name: of the result to take from each; None for the one in calibration/.
-        progress: called with (done, total) sessions.
 
     Raises:
         UsageError: fewer than two sessions, or one given twice.
-        SessionError: sessions of different rigs, a result of another rig, captures in two sessions, or no
-            camera and LiDAR in two of them.
-        NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
+        SessionError: sessions of different rigs, without a result or with that of another rig, captures in
+            two sessions, or no camera and LiDAR in two of them.
     """
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
@@ -98,31 +90,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     sessions = dict(zip(_session_names(paths), (Session.open(path) for path in paths), strict=True))
     _require_same(sessions)
     _require_independent(sessions)
-    results: dict[str, list[Calibration]] = {}
-    calibrated: list[str] = []
-    troubles: list[Finding] = []
-    for done, (label, session) in enumerate(sessions.items(), start=1):
-        where = result_folder(session.path, name)
-        if (where / RESULT).exists() or name not in (None, CURRENT):
-            results[label] = list(_read(session, where).pairs)
-        else:
-            try:
-                result = calibrate(session)
-            except NotEnoughDataError as error:
-                raise NotEnoughDataError(f"{label}: {error.what}", error.hint) from None
-            results[label] = list(result.pairs)
-            calibrated.append(label)
-            troubles += [
-                NOT_CALIBRATED(
-                    label,
-                    sensors=shortage.subject,
-                    cause=shortage.code,
-                    what=shortage.text,
-                    hint=shortage.advice,
-                )
-                for shortage in result.shortages
-            ]
-        progress(done, len(sessions))
+    results = {label: _read(each, result_folder(each.path, name)).pairs for label, each in sessions.items()}
     first_name, first = next(iter(sessions.items()))
     other_boards = [
         OTHER_BOARD(label, first=first_name)
@@ -130,7 +98,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
         if session.rig.board != first.rig.board
     ]
     comparisons, findings = _compare_sensors(results, "sessions")
-    return Repeat(first.rig.name, comparisons, tuple(calibrated), (*other_boards, *troubles, *findings))
+    return Repeat(first.rig.name, comparisons, (*other_boards, *findings))
 
 
 def _session_names(paths: Sequence[Path]) -> list[str]:

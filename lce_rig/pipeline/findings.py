@@ -58,7 +58,6 @@ FAILED = Kind(
     "the calibration of {subject} ({camera} and {lidar}) failed",
     "run `lce-rig calibrate {subject}` for its reasons",
 )
-NOT_CALIBRATED = Kind("repeat.not_calibrated", "{subject}: {sensors}: {what}", "{hint}", severity="warning")
 ONLY_ONE = Kind(
     "repeat.only_one", "{camera} and {lidar} are calibrated in {subject} only", severity="warning"
 )
