@@ -16,9 +16,6 @@ BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {wh
 TORN_END = _loss("torn_end", "{n} torn ends of the file skipped (first: {where})")
 PACKETS_LOST = _loss("packets_lost", "{n} packets lost in recording (first: {where})")
 BAG_TORN = _loss("bag_torn", "{n} places where the bag is torn (first: {where})")
-EVENTS_BEFORE_CLOCK_SET = _loss(
-    "events_before_clock_set", "{n} events before the clock was set skipped (first: {where})"
-)
 EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
 OUT_OF_ORDER = _loss("out_of_order", "{n} sent twice or out of order, skipped")

@@ -22,11 +22,8 @@ MAX_EVENT_PIXELS = 1 << 22
 """Of one event camera: four times the largest on sale; a damaged file may declare more."""
 # Recorders with several threads, and readout that is not in order, mix timestamps by this much at most.
 REORDER_NS = 20_000_000
-# Cameras may send a little before their clock is set at the start.
-_MAX_LEAD_NS = 1_000_000_000
-# More stray timestamps than this are not scattered damage but a clock that was set.
-_MAX_STRAY_SHARE = 0.01
-_MAX_DAMAGED_SHARE = 0.25
+# A whole stretch that is later by more than this is no damage: the clock was set.
+_CLOCK_SET_NS = 1_000_000_000
 # More events off the sensor than this are another sensor's; fewer are damage.
 _MAX_OFF_SHARE = 0.01
 _HOST_STRETCHES = 200
@@ -63,11 +60,6 @@ class EventStream:
             SourceError: nothing more can be read for a reason the user can repair.
         """
         raise NotImplementedError
-
-
-def seconds_in(t_ns: int, first_ns: int) -> str:
-    """Print how far into a recording a timestamp lies: "2.125 s in"."""
-    return f"{(t_ns - first_ns) * 1e-9:.3f} s in"
 
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:
@@ -253,64 +245,39 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
     Raises:
         SourceError: the timestamps run back for good; everything before has been yielded.
     """
-    held = NO_EVENTS
-    first_ns: int | None = None
-    delivered_ns: int | None = None
+    held, delivered_ns = NO_EVENTS, 1 - MAX_TIME_NS
     for stretch in stretches:
-        is_time = (stretch.t_ns > -MAX_TIME_NS) & (stretch.t_ns < MAX_TIME_NS)
-        current = stretch if is_time.all() else stretch.select(is_time)
-        losses.add(findings.EVENTS_STRAY(where="beyond any clock"), len(stretch) - len(current))
+        keep = (stretch.t_ns >= delivered_ns) & (stretch.t_ns < MAX_TIME_NS)
+        current = stretch if keep.all() else stretch.select(keep)
         if not len(current):
+            if len(stretch) and len(held) and int(stretch.t_ns.max()) < delivered_ns - _CLOCK_SET_NS:
+                yield held
+                back_s = (int(held.t_ns[-1]) - int(stretch.t_ns[0])) * 1e-9
+                what = f"{path}: the timestamps decrease by {back_s:.3f} s and do not recover"
+                hint = "The clock was set, or two recordings were joined: split the recording there."
+                raise SourceError(what, hint)
+            losses.add(findings.EVENTS_STRAY(where="too late, or beyond any clock"), len(stretch))
             continue
-        if first_ns is None:
-            first_ns = int(current.t_ns[0])
+        losses.add(findings.EVENTS_STRAY(where="too late, or beyond any clock"), len(stretch) - len(current))
         if len(held) and int(current.t_ns.min()) >= held.t_ns[-1]:
             yield held
-            delivered_ns = int(held.t_ns[-1])
-            held = current
+            delivered_ns, held = int(held.t_ns[-1]), current
         else:
-            held = join_events([held, current]) if len(held) else current
-        is_sorted = bool(np.all(held.t_ns[1:] >= held.t_ns[:-1]))
-        if is_sorted and (delivered_ns is None or delivered_ns <= held.t_ns[0]):
+            held = join_events([held, current])
+        if np.all(held.t_ns[1:] >= held.t_ns[:-1]):
             continue
-        reset = _find_reset(held.t_ns)
-        if reset is not None:
-            before_ns, after_ns = int(held.t_ns[:reset].max()), int(held.t_ns[reset])
-            back_s = (before_ns - after_ns) * 1e-9
-            where = f"{seconds_in(before_ns, first_ns)} the timestamps decrease by {back_s:.3f} s"
-            if delivered_ns is not None or before_ns - first_ns >= _MAX_LEAD_NS:
-                sound = _sorted(held.select(slice(0, reset)), first_ns, delivered_ns, losses)
-                if len(sound):
-                    yield sound
-                raise SourceError(
-                    f"{path}: {where} and do not recover",
-                    "The clock was set, or two recordings were joined: split the recording there.",
-                )
-            # Next to nothing came before the clock was set.
-            losses.add(findings.EVENTS_BEFORE_CLOCK_SET(where=where), reset)
-            held, first_ns = held.select(slice(reset, None)), after_ns
-        held = _sorted(held, first_ns, delivered_ns, losses)
-        cut = int(np.searchsorted(held.t_ns, held.t_ns[-1] - REORDER_NS)) if len(held) else 0
+        stray = _stray(held.t_ns)
+        if stray.any():
+            where = f"after {held.t_ns[max(int(np.argmax(stray)) - 1, 0)] * 1e-9:.3f} s"
+            losses.add(findings.EVENTS_STRAY(where=where), int(np.count_nonzero(stray)))
+        held = held.select(~stray)
+        held = held.select(np.argsort(held.t_ns, kind="stable"))
+        cut = int(np.searchsorted(held.t_ns, held.t_ns[-1] - REORDER_NS))
         if cut:
             yield held.select(slice(0, cut))
-            delivered_ns = int(held.t_ns[cut - 1])
-            held = held.select(slice(cut, None))
+            delivered_ns, held = int(held.t_ns[cut - 1]), held.select(slice(cut, None))
     if len(held):
         yield held
-
-
-def _sorted(events: EventColumns, first_ns: int, delivered_ns: int | None, losses: Losses) -> EventColumns:
-    """Leave out timestamps that are stray, or earlier than those delivered; sort the others."""
-    stray = _stray(events.t_ns)
-    if stray.any():
-        where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), first_ns)
-        losses.add(findings.EVENTS_STRAY(where=where), int(np.count_nonzero(stray)))
-        events = events.select(~stray)
-    if delivered_ns is not None:
-        is_late = events.t_ns < delivered_ns
-        losses.add(findings.EVENTS_STRAY(where="too late"), int(np.count_nonzero(is_late)))
-        events = events.select(~is_late)
-    return events.select(np.argsort(events.t_ns, kind="stable"))
 
 
 def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -319,13 +286,3 @@ def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
     # One timestamp too far ahead makes all that follow look late, and the reverse: the fewer are stray.
     return min(late, early, key=np.count_nonzero)
-
-
-def _find_reset(t_ns: NDArray[np.int64]) -> int | None:
-    """Find where a clock was set back: that divides a stream; damage lies between continuous timestamps."""
-    stray = _stray(t_ns)
-    n_stray = int(np.count_nonzero(stray))
-    is_between = not (stray[0] or stray[-1]) and n_stray <= _MAX_DAMAGED_SHARE * len(t_ns)
-    if is_between or n_stray <= max(1, _MAX_STRAY_SHARE * len(t_ns)):
-        return None
-    return int(np.argmax(np.maximum.accumulate(t_ns) - t_ns > REORDER_NS))

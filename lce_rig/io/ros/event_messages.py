@@ -18,7 +18,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, EventStream, seconds_in
+from lce_rig.io.events.event_recording import NS_PER_US, EventStream
 from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.messages import EventHead, decode_event_array, deserialize, header_stamp_ns
@@ -159,9 +159,7 @@ class BagEvents(EventStream):
         """Yield the events, one or several messages at a time."""
         decoder = PacketDecoder()
         last_number: int | None = None
-        first_ns: int | None = None
         for index, message in self._messages(self._topic, losses):
-            first_ns = message.log_ns if first_ns is None else first_ns
             try:
                 if message.msgtype in ARRAY_TYPES:
                     head, events = decode_event_array(message.data, message.encoding)
@@ -172,8 +170,7 @@ class BagEvents(EventStream):
                 self._check_size(packet.head)
                 yield from decoder.decode(packet)
             except ValueError as error:
-                where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
-                losses.add(findings.BROKEN_PACKETS(where=where))
+                losses.add(findings.BROKEN_PACKETS(where=f"message {index}: {error}"))
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = findings.PACKETS_LOST(where=f"before message {index}")

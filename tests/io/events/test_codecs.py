@@ -143,7 +143,7 @@ def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(t
     recording = open_events(write_packet_bag(tmp_path / name, [*sent[:12], *sent[14:]]))
     kept = [event for i, piece in enumerate(PIECES) if i not in (5, 9, 12, 13, 17) for event in piece]
     assert everything(recording) == kept
-    assert has_note(recording.notes, "5 broken packets", "message 5", "0.050 s")
+    assert has_note(recording.notes, "5 broken packets", "message 5")
     assert has_note(recording.notes, "5 packets lost"), "the broken ones and two that never came"
 
 

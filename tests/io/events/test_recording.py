@@ -72,7 +72,7 @@ def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted():
     before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
     recording = record(columns(before), columns(after[:400]), columns(after[400:]))
     assert stamps_us(recording) == after.tolist()
-    assert has_note(recording.notes, "200 events", "before")
+    assert has_note(recording.notes, "200 events", "stray")
     assert recording.span_ns == (0, 999_000_000)
     assert recording.start_ns == 0
 
