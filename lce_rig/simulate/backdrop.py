@@ -1,9 +1,9 @@
 """The static room in a camera's image: the costly half of rendering, computed once per session.
 
-Ceiling lamps and soft light from all walls, with shadows and reflections.
+Ceiling lamps and soft light from all walls, with shadows.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,91 +11,42 @@ from numpy.typing import NDArray
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.room import Room
-from lce_rig.simulate.scene import Hits, Raycaster, Surface, join_rows, surface_colour
+from lce_rig.simulate.scene import Hits, Raycaster, surface_colour
 
 #: Linear (blue, green, red) of light that comes from everywhere, and of one lamp at 1 m.
 _AMBIENT = np.array([0.400, 0.395, 0.385])
 _LAMP = np.array([1.50, 1.58, 1.62])
 
 
-def lamp_light(lamps: Array, points: Array, normals: Array) -> Array:
-    """Compute each lamp's unshadowed share E = I cos(a) cos(b) / d^2 of the irradiance.
+def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:
+    """Sum soft light and E = I cos(a) cos(b) / d^2 of each lamp, less where `occluders` hide it.
 
     Args:
         lamps: (P, 3) m, facing down.
         points: (N, 3) m.
         normals: (N, 3) unit.
+        occluders: of the lamps.
 
     Returns:
-        (N, P), in units of a lamp at 1 m.
+        (N, 3) linear (blue, green, red).
     """
-    share = np.empty((len(points), len(lamps)))
-    for k, lamp in enumerate(lamps):
+    of_lamps = np.zeros(len(points))
+    for lamp in lamps:
         way = lamp - points
         inverse = 1.0 / np.sqrt(np.maximum(np.einsum("nc,nc->n", way, way), 1e-12))
         cosine = np.einsum("nc,nc->n", way, normals) * inverse
         # A lamp has size: its light wraps a little round bodies and does not grow without bound near it.
         wrapped = np.maximum((cosine + 0.1) / 1.1, 0.0)
-        share[:, k] = wrapped * np.maximum(way[:, 2], 0.0) * inverse * np.minimum(inverse, 1 / 0.6) ** 2
-    return share
-
-
-def ambient_light(normals: Array) -> Array:
-    """Compute the soft light (N, 3); what looks up gets a little more."""
-    return np.asarray((0.85 + 0.15 * normals[:, 2:]) * _AMBIENT)
-
-
-def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:
-    """Sum soft and lamp light (N, 3) at points (N, 3), without lamps hidden by `occluders`."""
-    share = lamp_light(lamps, points, normals)
-    if occluders is not None:
-        lifted = points + 2e-3 * normals
-        for k, lamp in enumerate(lamps):
-            lit = np.flatnonzero(share[:, k] > 0)
+        share = wrapped * np.maximum(way[:, 2], 0.0) * inverse * np.minimum(inverse, 1 / 0.6) ** 2
+        if occluders is not None:
+            lit = np.flatnonzero(share > 0)
             # Stop short of the lamp's own housing.
-            share[lit[occluders.is_blocked(lifted[lit], lamp - [0.0, 0.0, 0.06])], k] *= 0.15
-    return np.asarray(ambient_light(normals) + share.sum(axis=1, keepdims=True) * _LAMP)
-
-
-@dataclass(frozen=True, eq=False)
-class Mirrors:
-    """The rays that hit a shiny surface, and their reflection of the static room.
-
-    Attributes:
-        index: (M,) of the rays.
-        starts: (M, 3) m, world.
-        directions: (M, 3) unit, world.
-        weight: (M, 1) of the mirror image.
-        image: (M, 3) linear radiance of the mirror image.
-        range_m: (M,) how far away the mirrored surface is.
-    """
-
-    index: NDArray[np.intp]
-    starts: Array
-    directions: Array
-    weight: Array
-    image: Array
-    range_m: Array
-
-
-def static_radiance(
-    room: Raycaster, lamps: Array, origin: Array, directions: Array
-) -> tuple[Array, Hits, Mirrors]:
-    """Compute what rays (N, 3) see of the standing room: linear (N, 3), what they hit, mirrors."""
-    hits = room.cast(origin, directions)
-    points = reached(origin, directions, hits)
-    light = irradiance(lamps, points, hits.normals, room)
-    radiance = _surface_radiance(room.surfaces, hits, points, light)
-    gloss = np.array([*(s.material.gloss for s in room.surfaces), 0.0])[hits.surface]
-    shiny = np.flatnonzero(gloss > 0)
-    weight = mirror_weight(gloss[shiny], hits.normals[shiny], directions[shiny])
-    mirrored = mirror(directions[shiny], hits.normals[shiny])
-    starts = points[shiny] + 1e-3 * hits.normals[shiny]
-    again = room.cast(starts, mirrored)
-    there = reached(starts, mirrored, again)
-    image = _surface_radiance(room.surfaces, again, there, irradiance(lamps, there, again.normals))
-    radiance[shiny] = (1 - weight) * radiance[shiny] + weight * image
-    return radiance, hits, Mirrors(shiny, starts, mirrored, weight, image, again.range_m)
+            is_hidden = occluders.is_blocked(points[lit] + 2e-3 * normals[lit], lamp - [0.0, 0.0, 0.06])
+            share[lit[is_hidden]] *= 0.15
+        of_lamps += share
+    # What looks up gets a little more of the soft light.
+    soft = (0.85 + 0.15 * normals[:, 2:]) * _AMBIENT
+    return np.asarray(soft + of_lamps[:, None] * _LAMP)
 
 
 def reached(origins: Array, directions: Array, hits: Hits) -> Array:
@@ -103,35 +54,6 @@ def reached(origins: Array, directions: Array, hits: Hits) -> Array:
     return np.asarray(origins + np.where(np.isfinite(hits.range_m), hits.range_m, 0.0)[:, None] * directions)
 
 
-def mirror(directions: Array, normals: Array) -> Array:
-    """Mirror directions (N, 3) at surfaces with unit normals (N, 3)."""
-    along = np.einsum("nc,nc->n", directions, normals)
-    return np.asarray(directions - 2 * along[:, None] * normals)
-
-
-def mirror_weight(gloss: Array, normals: Array, directions: Array) -> Array:
-    """Weigh the mirror image (N, 1) by Schlick's approximation of Fresnel's law.
-
-    References:
-        C. Schlick, An inexpensive BRDF model for physically-based rendering, CGF 13(3), 1994.
-    """
-    cosine = np.abs(np.einsum("nc,nc->n", normals, directions))
-    return np.asarray((gloss * (0.12 + 0.88 * (1 - cosine) ** 5))[:, None])
-
-
-def _surface_radiance(surfaces: tuple[Surface, ...], hits: Hits, points: Array, light: Array) -> Array:
-    out = np.zeros((len(points), 3))
-    for index in np.unique(hits.surface):
-        if index < 0:
-            continue
-        rows = np.flatnonzero(hits.surface == index)
-        surface = surfaces[index]
-        colour = surface_colour(surface, points[rows], hits.normals[rows])
-        out[rows] = colour * (light[rows] + surface.material.emission)
-    return out
-
-
-SHADOW_STEP_PX = 4
 _KNOT_STEP_PX = 4
 _EDGE_TONE, _EDGE_SAMPLES = 0.05, 2
 _CHUNK = 1 << 18
@@ -147,10 +69,7 @@ class Backdrop:
         corner_rays: (H + 1, W + 1, 3) unit rays through the pixels' corners, world.
         radiance: (H, W, 3) linear (blue, green, red).
         range_m: (H, W) along the ray through each pixel's centre.
-        mirrors: shiny surfaces, indexed by row-major pixel.
         lamps: (P, 3) m, world.
-        shadow_points: (h, w, 3) m, seen by every fourth pixel, world.
-        shadow_share: (h, w, P) each lamp's share of the light there.
     """
 
     intrinsics: Intrinsics
@@ -158,10 +77,7 @@ class Backdrop:
     corner_rays: Array
     radiance: Array
     range_m: Array
-    mirrors: Mirrors
     lamps: Array
-    shadow_points: Array
-    shadow_share: Array
 
     @property
     def origin(self) -> Array:
@@ -175,31 +91,16 @@ def build_backdrop(room: Room, T_world_cam: Array, intrinsics: Intrinsics) -> Ba
     origin = T_world_cam[:3, 3]
     corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
     rays = pixel_rays(corners).reshape(-1, 3)
-    flat, hits, mirrors = _render(room, origin, rays)
+    flat, range_m = _render(room, origin, rays)
     radiance = flat.reshape(*shape, 3)
     # Resample the pixels that differ much from a neighbour.
     tone = np.sqrt(np.clip(radiance.mean(axis=2), 0.0, 1.0))
     down, across = (np.abs(np.diff(tone, axis=axis)) > _EDGE_TONE for axis in (0, 1))
     rows, cols = np.nonzero(beside_changes(down, across))
     spread = sub_rays(corners, rows, cols, _EDGE_SAMPLES)
-    sampled, _, _ = _render(room, origin, spread.reshape(-1, 3))
+    sampled, _ = _render(room, origin, spread.reshape(-1, 3))
     radiance[rows, cols] = sampled.reshape(spread.shape).mean(axis=1)
-
-    coarse = (slice(None, None, SHADOW_STEP_PX), slice(None, None, SHADOW_STEP_PX))
-    points = reached(origin, rays, hits).reshape(*shape, 3)[coarse]
-    normals = hits.normals.reshape(*shape, 3)[coarse]
-    share = lamp_light(room.lamps, points.reshape(-1, 3), normals.reshape(-1, 3))
-    return Backdrop(
-        intrinsics=intrinsics,
-        T_world_cam=T_world_cam,
-        corner_rays=corners,
-        radiance=radiance,
-        range_m=hits.range_m.reshape(shape),
-        mirrors=mirrors,
-        lamps=room.lamps,
-        shadow_points=points,
-        shadow_share=share.reshape(*points.shape[:2], -1),
-    )
+    return Backdrop(intrinsics, T_world_cam, corners, radiance, range_m.reshape(shape), room.lamps)
 
 
 def pixel_corner_rays(intrinsics: Intrinsics) -> Array:
@@ -282,13 +183,23 @@ def beside_changes(changes_down: NDArray[np.bool_], changes_across: NDArray[np.b
     return edge
 
 
-def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Hits, Mirrors]:
-    """Compute `static_radiance` in pieces that fit the cache and the memory."""
+def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Array]:
+    """Compute what rays (N, 3) see of the standing room: linear (N, 3), and how far away that is (N,), m.
+
+    It is done in pieces that fit the cache and the memory.
+    """
+    surfaces = room.raycaster.surfaces
     pieces = []
     for start in range(0, len(rays), _CHUNK):
-        radiance, hits, mirrors = static_radiance(
-            room.raycaster, room.lamps, origin, rays[start : start + _CHUNK]
-        )
-        pieces.append((radiance, hits, replace(mirrors, index=mirrors.index + start)))
-    radiances, hits_of, mirrors_of = zip(*pieces, strict=True)
-    return np.concatenate(radiances), join_rows(hits_of), join_rows(mirrors_of)
+        directions = rays[start : start + _CHUNK]
+        hits = room.raycaster.cast(origin, directions)
+        points = reached(origin, directions, hits)
+        light = irradiance(room.lamps, points, hits.normals, room.raycaster)
+        radiance = np.zeros((len(points), 3))
+        for index in np.unique(hits.surface[hits.surface >= 0]):
+            rows = np.flatnonzero(hits.surface == index)
+            colour = surface_colour(surfaces[index], points[rows], hits.normals[rows])
+            radiance[rows] = colour * (light[rows] + surfaces[index].material.emission)
+        pieces.append((radiance, hits.range_m))
+    radiances, ranges_m = zip(*pieces, strict=True)
+    return np.concatenate(radiances), np.concatenate(ranges_m)

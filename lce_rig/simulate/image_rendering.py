@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import (
-    SHADOW_STEP_PX,
     Backdrop,
     beside_changes,
     irradiance,
@@ -26,22 +25,39 @@ Light = NDArray[np.float32]
 
 
 def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
-    """Compute what reaches the lens: linear (H, W, 3).
+    """Compute what reaches the lens: linear (H, W, 3), anti-aliased where an edge of board or carrier runs.
 
     Args:
         scene: the room of the backdrop, with the board and its carrier.
         backdrop: the camera and its image of the static room.
     """
-    radiance = backdrop.radiance * _shadow(scene, backdrop)[..., None]
-    _paint_mirror_images(radiance, scene, backdrop)
-    _paint_moving(radiance, scene, backdrop)
+    radiance: Array = backdrop.radiance.copy()
+    rows, cols = _region(scene, backdrop)
+    if rows.stop <= rows.start or cols.stop <= cols.start:
+        return radiance
+    corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
+    window = _ImageWindow(corners, backdrop.radiance[rows, cols], backdrop.range_m[rows, cols])
+    label, colour, light = _look_through_centres(scene, backdrop, window)
+    painted = np.where((label >= 0)[..., None], colour * light, window.backdrop)
+
+    is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
+    is_carrier = (label >= 0) & (label < scene.board_index)
+    lights = (_spread(light, is_carrier), _spread(light, label >= scene.board_index))
+    # Far from the carrier, rays can only hit the board; this saves half of them.
+    near_carrier = _dilate(_dilate(is_carrier))
+    for with_carrier in (False, True):
+        v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
+        if len(v):
+            rays = sub_rays(corners, v, u, SUBPIXELS)
+            painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays, with_carrier)
+    radiance[rows, cols] = painted
     return radiance
 
 
 def glance(scene: Scene, backdrop: Backdrop, noise: CameraNoise) -> tuple[tuple[slice, slice], Light]:
     """Compute the light on the sensor where board and carrier are, at a tenth of `render_radiance`'s time.
 
-    One ray a pixel, no shadows, no mirror images: for boards on their way, of which nothing is captured.
+    One ray a pixel, no shadows: for boards on their way, of which nothing is captured.
 
     Returns:
         Rows and columns of the part of the image; and the linear light (h, w, 3) there.
@@ -61,39 +77,14 @@ def glance(scene: Scene, backdrop: Backdrop, noise: CameraNoise) -> tuple[tuple[
     return (rows, cols), _focus(radiance, sensor_gain(*backdrop.range_m.shape, noise)[rows, cols], noise)
 
 
-def _shadow(scene: Scene, backdrop: Backdrop) -> Array:
-    """Compute the share (H, W) of the light on the room that the board and its carrier let through."""
-    import cv2
-
-    shape = backdrop.shadow_points.shape[:2]
-    points = backdrop.shadow_points.reshape(-1, 3)
-    share = backdrop.shadow_share.reshape(len(points), -1)
-    lost = np.zeros(len(points))
-    for k, lamp in enumerate(backdrop.lamps):
-        lit = np.flatnonzero(share[:, k] > 0.01)
-        is_blocked = scene.occluders.is_blocked(points[lit], lamp)
-        lost[lit[is_blocked]] += share[lit[is_blocked], k]
-    through = 1.0 - 0.85 * lost / (share.sum(axis=1) + 0.35)
-    soft = cv2.GaussianBlur(through.reshape(shape), (0, 0), 1.2)
-    height, width = backdrop.range_m.shape
-    # Pixel k * step of the full image is pixel k of the coarse one.
-    to_coarse = np.array([[1 / SHADOW_STEP_PX, 0, 0], [0, 1 / SHADOW_STEP_PX, 0]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(soft, to_coarse, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    )
-
-
-def _region(scene: Scene, backdrop: Backdrop, *, is_mirrored: bool = False) -> tuple[slice, slice]:
-    """Bound the pixels that the board and its carrier (or their image in the floor) can touch."""
+def _region(scene: Scene, backdrop: Backdrop) -> tuple[slice, slice]:
+    """Bound the pixels that the board and its carrier can touch."""
     height, width = backdrop.range_m.shape
     outline = transform(scene.T_world_board, scene.board.outline())
     # Lenses bend straight edges: bound the plate by many points along them.
     along = np.linspace(0, 1, 33)[:, None, None]
     edges = (1 - along) * outline + along * np.roll(outline, -1, axis=0)
     points = np.concatenate([*(s.mesh.vertices for s in scene.moving.surfaces), edges.reshape(-1, 3)])
-    if is_mirrored:
-        points = points * [1.0, 1.0, -1.0]
     pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), points))
     if not is_valid.any():
         return slice(0, 0), slice(0, 0)
@@ -105,50 +96,12 @@ def _region(scene: Scene, backdrop: Backdrop, *, is_mirrored: bool = False) -> t
     return slice(v0, v1), slice(u0, u1)
 
 
-def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
-    """Let the shiny floor show the board and its carrier in the image (H, W, 3), in place."""
-    rows, cols = _region(scene, backdrop, is_mirrored=True)
-    mirrors = backdrop.mirrors
-    v, u = np.divmod(mirrors.index, backdrop.range_m.shape[1])
-    near = np.flatnonzero((v >= rows.start) & (v < rows.stop) & (u >= cols.start) & (u < cols.stop))
-    hits = scene.cast_moving(mirrors.starts[near], mirrors.directions[near])
-    seen = np.flatnonzero(hits.range_m < mirrors.range_m[near])
-    chosen = near[seen]
-    kept = hits.select(seen)
-    points = reached(mirrors.starts[chosen], mirrors.directions[chosen], kept)
-    image = scene.colour(kept, points) * irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
-    radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
-
-
 class _ImageWindow(NamedTuple):
     """The rays (h + 1, w + 1, 3), the room's radiance (h, w, 3) and range (h, w) in a part of an image."""
 
     corner_rays: Array
     backdrop: Array
     backdrop_range_m: Array
-
-
-def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
-    """Paint board and carrier over the backdrop (H, W, 3), in place, anti-aliased where an edge runs."""
-    rows, cols = _region(scene, backdrop)
-    if rows.stop <= rows.start or cols.stop <= cols.start:
-        return
-    corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
-    window = _ImageWindow(corners, radiance[rows, cols].copy(), backdrop.range_m[rows, cols])
-    label, colour, light = _look_through_centres(scene, backdrop, window)
-    painted = np.where((label >= 0)[..., None], colour * light, window.backdrop)
-
-    is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
-    is_carrier = (label >= 0) & (label < scene.board_index)
-    lights = (_spread(light, is_carrier), _spread(light, label >= scene.board_index))
-    # Far from the carrier, rays can only hit the board; this saves half of them.
-    near_carrier = _dilate(_dilate(is_carrier))
-    for with_carrier in (False, True):
-        v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
-        if len(v):
-            rays = sub_rays(corners, v, u, SUBPIXELS)
-            painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays, with_carrier)
-    radiance[rows, cols] = painted
 
 
 def _look_through_centres(

@@ -12,7 +12,7 @@ from lce_rig.simulate.scene import Raycaster, Surface
 from lce_rig.simulate.surfaces import Material, Mesh, box, cone, ellipsoid, inside_box, limb, merge, rectangle
 
 _WALL = Material((0.66, 0.70, 0.72), 0.75)
-_FLOOR = Material((0.42, 0.47, 0.50), 0.45, "tiles", gloss=0.5)
+_FLOOR = Material((0.42, 0.47, 0.50), 0.45, "tiles")
 _CEILING = Material((0.75, 0.77, 0.78), 0.8, "panels")
 _SKIRTING = Material((0.05, 0.06, 0.08), 0.15)
 _WOOD = Material((0.16, 0.30, 0.48), 0.5, "wood")

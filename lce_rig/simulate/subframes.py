@@ -1,6 +1,6 @@
 """Grey images of the moving board: hundreds per second, smooth enough for event pixels.
 
-`render_radiance` draws single images with shadows and mirror images. Here the room is one fixed image, the
+`render_radiance` draws single images with shadows on the board. Here the room is one fixed image, the
 board is drawn analytically, and its carrier is a cut-out that shifts. Edges are smoothed by their distance
 in units of the pixel's own spread, not by sampling: intensities change without steps as the board moves.
 """

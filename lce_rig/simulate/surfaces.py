@@ -20,14 +20,12 @@ class Material:
         colour: linear (blue, green, red) albedo, 0..1.
         reflectivity: at the LiDAR's 905 nm, 0..1; 0 gives no return (glass).
         pattern: what is printed on it.
-        gloss: weight of the mirror image at grazing sight, 0..1.
         emission: linear radiance of its own, in units of the albedo.
     """
 
     colour: tuple[float, float, float]
     reflectivity: float
     pattern: Pattern = "plain"
-    gloss: float = 0.0
     emission: float = 0.0
 
 
