@@ -10,7 +10,7 @@
     by_likelihood        uncertainty
 
 Channels of one camera, frames and events, share pixels and lens, not their times. Together they give one set
-of extrinsics; each is also calibrated alone, and two are compared by Algorithm 1, as a camera has one pose.
+of extrinsics; two are compared by Algorithm 1, as a camera has one pose.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1, solve
+from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
@@ -26,18 +26,15 @@ from lce_rig.calibrate.motion.board_motion import sample_poses
 from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
 from lce_rig.calibrate.observations import Clocks, join_scans
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.session_lens import fit_session_lens
 from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter, with_profile
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array, PoseDifference, difference
+from lce_rig.core.geometry import PoseDifference, difference
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
-
-_N_SHARES = 7
 
 
 def estimate_extrinsics(
@@ -67,46 +64,33 @@ def estimate_extrinsics(
     scans, conflicts = join_scans(matched, candidates)
     samples = sample_poses(scans, clocks, noise_px)
 
-    def result_of(
-        name: str, alone: CalibrationEstimate, cov: Array, still: Algorithm1 | None = None
-    ) -> ChannelResult:
-        scatter_m = depth_scatter_m(alone.T_cam_lidar, list(alone.observations.values()))
-        still_m = depth_scatter_m(still.T_cam_lidar, still.observations) if still else scatter_m
-        of_all = name, len(matched[name]), noise_px[name]
-        return ChannelResult(*of_all, alone.T_cam_lidar, cov, scatter_m, still_m)
+    of_channels = {
+        name: ChannelResult(name, len(observations), noise_px[name]) for name, observations in matched.items()
+    }
 
     if len(agreed) == 1 and np.count_nonzero(samples.tells_motion) < MIN_MOVING:
-        ((name, of_channel),) = matched.items()
+        ((_, of_channel),) = matched.items()
         estimate = estimate_observations(of_channel, board, settings, progress)
-        channel = result_of(name, estimate, estimate.cov)
-        return _with_consensus(replace(estimate, channels=(channel,)), list(agreed.values()))
+        estimate = replace(estimate, channels=tuple(of_channels.values()))
+        return _with_consensus(estimate, list(agreed.values()))
 
     begin(progress, "motion of the board")
-    still = {name: solve(observations, board) for name, observations in matched.items()}
-    motion = estimate_motion(scans, samples, board, next(iter(still.values())), clocks)
+    motion = estimate_motion(scans, samples, board, solve(next(iter(matched.values())), board), clocks)
     estimate = estimate_observations(motion.observations(), board, settings, progress)
     estimate = _with_consensus(estimate, list(agreed.values()))
-
-    fast = replace(settings, tolerances=None, lens=None)
-    by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
-    channels = []
-    for name, observations in by_channel.items():
-        begin(progress, f"{name} alone")
-        alone = estimate_observations(observations, board, fast)
-        result = result_of(name, alone, motion.widened(alone.cov), still[name])
-        if motion.offset_s is not None:
-            index = motion.samples.channels.index(name)
-            offset_s, sigma_s = float(motion.offset_s[index]), float(np.sqrt(motion.cov[index, index]))
-            result = replace(result, time_offset_s=offset_s, time_offset_sigma_s=sigma_s)
-        channels.append(result)
-    begin(progress, "difference of the channels")
+    if motion.offset_s is not None:
+        sigma_s = np.sqrt(np.diag(motion.cov))
+        for name, offset_s, sigma in zip(
+            samples.channels, motion.offset_s.tolist(), sigma_s.tolist(), strict=True
+        ):
+            of_channels[name] = replace(of_channels[name], time_offset_s=offset_s, time_offset_sigma_s=sigma)
     return replace(
         estimate,
         cov=motion.widened(estimate.cov),
         refused={**conflicts, **estimate.refused},
         same_scan={scan.capture: scan.captures for scan in scans if len(scan.captures) > 1},
-        channels=tuple(channels),
-        channel_difference=_difference(motion, tuple(by_channel.values()), board),
+        channels=tuple(of_channels[name] for name in sorted(of_channels)),
+        channel_difference=_difference(motion, sorted(of_channels), board),
     )
 
 
@@ -199,47 +183,10 @@ def _with_consensus(estimate: CalibrationEstimate, agreed: Sequence[Consensus]) 
     return replace(estimate, refused=dict(sorted(refused.items())))
 
 
-def depth_scatter_m(T_cam_lidar: Array, observations: Sequence[Observation]) -> float:
-    """Compute the standard deviation over captures of the LiDAR's mean distance from the camera's plane."""
-    T_cam_board = np.array([observation.image.T_cam_board for observation in observations])
-    middles = np.array([observation.lidar.points.mean(axis=0) for observation in observations])
-    depths = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, T_cam_lidar)
-    return float(np.std(depths))
-
-
-def _difference(
-    motion: Motion, by_channel: Sequence[Sequence[Observation]], board: Board
-) -> PoseDifference | None:
-    """Compare two channels' extrinsics.
-
-    If only the two channels together show how boards moved, each pose depends on both; then one channel's
-    extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
-    share them out the median counts.
-
-    Args:
-        motion: of the boards.
-        by_channel: observations of each channel, positioned by it alone.
-        board: its specification.
-    """
-    if len(by_channel) != 2:
+def _difference(motion: Motion, channels: Sequence[str], board: Board) -> PoseDifference | None:
+    """Compare two channels' extrinsics; None where only both together show how boards moved."""
+    if len(channels) != 2 or not motion.is_seen_by_each:
         return None
-    if motion.is_seen_by_each:
-        first, second = (solve(observations, board) for observations in by_channel)
-        covs = [motion.widened(each.cost.jackknife_covariance()[:6, :6]) for each in (first, second)]
-        return PoseDifference(difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1])
-    rng = np.random.default_rng(0)
-    ways: list[PoseDifference] = []
-    for _ in range(_N_SHARES):
-        mine = set(rng.permutation(len(motion.scans))[: len(motion.scans) // 2].tolist())
-        names = {motion.scans[k].capture for k in mine}
-        try:
-            halves = [
-                solve([o for o in observations if (o.capture in names) == is_first], board)
-                for observations, is_first in zip(by_channel, (True, False), strict=True)
-            ]
-        except NotEnoughDataError:
-            continue  # This split of few scans leaves a direction undetermined; others may not.
-        apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
-        cov = sum(half.cost.jackknife_covariance()[:6, :6] for half in halves)
-        ways.append(PoseDifference(apart, np.asarray(cov)))
-    return sorted(ways, key=lambda way: way.chi2)[len(ways) // 2] if ways else None
+    first, second = (solve(motion.observations(channel), board) for channel in channels)
+    covs = [motion.widened(each.cost.jackknife_covariance()[:6, :6]) for each in (first, second)]
+    return PoseDifference(difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1])

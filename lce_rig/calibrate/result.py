@@ -66,8 +66,8 @@ class CalibrationEstimate:
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
-        channels: the result of each channel of the camera alone; empty if they were not separated.
-        channel_difference: of the extrinsics of two channels; None with one channel.
+        channels: of the camera, with the time offset of each; empty if they were not separated.
+        channel_difference: of the extrinsics of two channels; None where they cannot be compared.
     """
 
     T_cam_lidar: Array

@@ -414,15 +414,7 @@ def _channel_texts(calibration: Calibration) -> list[str]:
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
             text += (
                 f", time offset {1000 * result.time_offset_s:+.0f} +- "
-                f"{1000 * result.time_offset_sigma_s:.0f} ms, "
-                f"depth scatter {1000 * result.depth_scatter_m:.1f} mm "
-                f"({1000 * result.depth_scatter_still_m:.1f} without motion compensation)"
+                f"{1000 * result.time_offset_sigma_s:.0f} ms"
             )
         texts.append(text)
-    figures = calibration.diagnostics
-    if math.isfinite(figures.channels_rotation_deg):
-        texts.append(
-            f"channels differ by {figures.channels_rotation_deg:.2f} deg, "
-            f"{1000 * figures.channels_translation_m:.1f} mm"
-        )
     return texts

@@ -168,26 +168,20 @@ class Diagnostics:
     noise_across_m: float = math.nan
     alone_sigma_rotation_deg: float = math.nan  # standard deviations without the other cameras
     alone_sigma_translation_m: float = math.nan
-    channels_rotation_deg: float = math.nan  # between the extrinsics of two channels of the camera
-    channels_translation_m: float = math.nan
 
     def figures(self) -> dict[str, float]:
         """List the figures that are not NaN by name, sorted."""
         return {name: value for name, value in sorted(asdict(self).items()) if not math.isnan(value)}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ChannelResult:
-    """The result of one channel of a camera alone, with its time offset.
+    """One channel of a camera, with its time offset.
 
     Attributes:
         channel: its name.
         n_captures: captures in which it shows the board and agrees with the others.
         noise_px: corner noise per coordinate, from the residuals of all its images.
-        T_cam_lidar: (4, 4) extrinsic from this channel's images; from others' only how boards moved.
-        cov: (6, 6) of it, as `Calibration.cov`.
-        depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
-        depth_scatter_still_m: the same if boards are taken to have stood still.
         time_offset_s: correction to add to its timestamps, beyond the profile's expected offset, to reach the
             LiDAR's time; images without timestamps count from the scan's first firing. None if nothing moved.
         time_offset_sigma_s: standard deviation of that.
@@ -196,10 +190,6 @@ class ChannelResult:
     channel: str
     n_captures: Count
     noise_px: Size
-    T_cam_lidar: Pose
-    cov: Covariance
-    depth_scatter_m: Size
-    depth_scatter_still_m: Size
     time_offset_s: Number | None = None
     time_offset_sigma_s: Size | None = None
 
@@ -426,7 +416,7 @@ class Calibration:
 
     Attributes:
         channels: of the camera, names.
-        channel_results: the result of each of these alone.
+        channel_results: time offset and noise of each of these.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
             with `intrinsics`, and with point clouds as the LiDAR's driver delivers them.
@@ -625,7 +615,7 @@ class ResultFile:
             ResultRefusedError: a pose or covariance is not finite.
         """
         for pair in self.pairs:
-            evidence = (pair, *pair.channel_results, *pair.other_cameras, pair.scene_share)
+            evidence = (pair, *pair.other_cameras, pair.scene_share)
             values = [value for record in evidence if record for value in vars(record).values()]
             if not all(np.isfinite(value).all() for value in values if isinstance(value, np.ndarray)):
                 raise ResultRefusedError(

@@ -426,10 +426,6 @@ def _judged(
         others += share_findings(own.share)
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     verdict, findings = judge(estimate, validation, rig, own.camera, own.lidar, n_captures, others)
-    diagnostics = estimate.diagnostics
-    if estimate.channel_difference is not None:
-        apart_deg, apart_m = tangent_sizes(estimate.channel_difference.tangent)
-        diagnostics = replace(diagnostics, channels_rotation_deg=apart_deg, channels_translation_m=apart_m)
     used = estimate.captures_of(estimate.used)
     refused = dict(own.refused)
     for name, why in estimate.refused.items():
@@ -458,7 +454,7 @@ def _judged(
         captures_refused={name: refused[name] for name in sorted(refused) if name not in used},
         verdict=verdict,
         findings=findings,
-        diagnostics=diagnostics,
+        diagnostics=estimate.diagnostics,
         channel_results=estimate.channels,
         method=estimate.method,
         uncertainty=point_uncertainties(

@@ -38,8 +38,7 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
                 clocks += _clock_rows(recorded, rig, detections)
     if clocks:
         print()
-        head = "set, channel, captures, corner noise px, time offset ms, depth scatter mm"
-        print_head(*head.split(", "), "without compensation mm", "channels differ by deg / mm")
+        print_head("set", "channel", "captures", "corner noise px", "time offset ms")
         for row in clocks:
             print_row(*row)
 
@@ -134,21 +133,10 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
     (calibration, *_), _ = calibrate_detections(rig, detections)
-    figures = calibration.diagnostics
-    apart = f"{figures.channels_rotation_deg:.2f} / {1000 * figures.channels_translation_m:.1f}"
     for result in calibration.channel_results:
         clock = "-"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
             # Their clouds carry the stamp of the last packet, a sweep after the first firing.
             since_last_s = result.time_offset_s - 0.1
             clock = f"{1000 * since_last_s:+.0f} +- {1000 * result.time_offset_sigma_s:.0f}"
-        yield (
-            recorded.name,
-            result.channel,
-            result.n_captures,
-            f"{result.noise_px:.2f}",
-            clock,
-            f"{1000 * result.depth_scatter_m:.1f}",
-            f"{1000 * result.depth_scatter_still_m:.1f}",
-            apart,
-        )
+        yield recorded.name, result.channel, result.n_captures, f"{result.noise_px:.2f}", clock

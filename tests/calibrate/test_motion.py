@@ -123,7 +123,6 @@ def test_a_channel_that_is_followed_is_compensated_alone():
     result = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     (events,) = result.channels
     assert abs(events.time_offset_s - 0.06) < 4 * events.time_offset_sigma_s
-    assert events.depth_scatter_m < events.depth_scatter_still_m / 3
     assert np.all(errors(result.T_cam_lidar) < [0.1, 4.0])
 
 

@@ -54,8 +54,8 @@ def full():
         channels=("events", "frames"),
         method="ml",
         channel_results=(
-            ChannelResult("events", 3, 0.2, T, cov, 0.01, 0.02, -0.003, 0.001),
-            ChannelResult("frames", 2, 0.1, T, cov, 0.01, 0.02),
+            ChannelResult("events", 3, 0.2, -0.003, 0.001),
+            ChannelResult("frames", 2, 0.1),
         ),
         egt_rotation_deg=0.5,
         egt_translation_m=0.01,

@@ -33,7 +33,7 @@ def calibration_of(results: tuple[ChannelResult, ...]) -> Calibration:
 
 def result_of(channel: str, offset_s: float | None) -> ChannelResult:
     noise_px = {"frames": 0.1, "events": 0.2}[channel]
-    return ChannelResult(channel, 12, noise_px, T_FORWARD, np.eye(6) * 1e-6, 0.01, 0.02, offset_s, 0.001)
+    return ChannelResult(channel, 12, noise_px, offset_s, 0.001)
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def test_the_size_of_a_contradiction_decides_and_its_axis_names_the_cause(
 
 
 def test_of_moving_boards_the_times_may_be_wrong(seen):
-    channel = ChannelResult("frames", 9, 0.1, seen.truth.T_cam_lidar, seen.truth.cov, 0.01, 0.02, 0.03, 0.004)
+    channel = ChannelResult("frames", 9, 0.1, 0.03, 0.004)
     moving = replace(seen.truth, channel_results=(channel,))
     slight = AxisDrift("rotation_y", "changed", 0.31, 0.1, 0.5)
     judged = with_opinion(moving, SceneOpinion(6, 500, (slight,)))

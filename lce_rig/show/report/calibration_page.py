@@ -311,8 +311,6 @@ def _clock_rows(c: Calibration) -> list[Row]:
         ("captures", *(r.n_captures for r in c.channel_results)),
         ("corner noise", *(f"{r.noise_px:.2f} px" for r in c.channel_results)),
         ("time offset", *offsets),
-        ("depth scatter", *(f"{1000 * r.depth_scatter_m:.1f} mm" for r in c.channel_results)),
-        ("  without compensation", *(f"{1000 * r.depth_scatter_still_m:.1f} mm" for r in c.channel_results)),
     ]
 
 
