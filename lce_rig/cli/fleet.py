@@ -1,6 +1,5 @@
 """`lce-rig fleet`: run the sessions of many robots, ask questions of their results, and deploy them."""
 
-import csv
 import json
 import math
 import os
@@ -55,8 +54,7 @@ def fleet() -> None:
 @click.option(
     "--manifest",
     metavar="FILE",
-    help="Read robots, profiles, collectors and sites from this file "
-    "[default: ROOT/fleet.yaml, if there is one].",
+    help="Read robots and profiles from this file [default: ROOT/fleet.yaml, if there is one].",
 )
 @click.option(
     "--workers",
@@ -158,20 +156,15 @@ def run(
     "--columns",
     callback=split_names,
     metavar="NAME[,NAME]",
-    help="Choose columns [default: all with --csv and --json, else the most important].",
+    help="Choose columns [default: all with --json, else the most important].",
 )
-@click.option("--csv", "as_csv", is_flag=True, help="Print comma-separated values.")
 @json_option
 @click.option("--rebuild", is_flag=True, help="Write the table again from the folders of all results first.")
-def table(
-    registry: str, where: str, columns: list[str] | None, as_csv: bool, as_json: bool, rebuild: bool
-) -> None:
+def table(registry: str, where: str, columns: list[str] | None, as_json: bool, rebuild: bool) -> None:
     """Print rows of the registry's table."""
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.storage import Storage
 
-    if as_csv and as_json:
-        raise UsageError("--csv and --json exclude each other", "Choose one.")
     opened: Registry = Registry(Storage.at(registry))
     if rebuild:
         if not opened.place.exists():
@@ -180,17 +173,9 @@ def table(
                 "`lce-rig fleet run ROOT --registry FOLDER` writes a registry.",
             )
         opened.consolidate(rebuild=True)
-    chosen = opened.read_table(columns or (None if as_csv or as_json else _SHOWN), where)
+    chosen = opened.read_table(columns or (None if as_json else _SHOWN), where)
     every = (row for batch in chosen.to_batches(max_chunksize=10_000) for row in batch.to_pylist())
-    if as_csv:
-        writer = csv.writer(sys.stdout, lineterminator="\n")
-        writer.writerow(chosen.column_names)
-        for row in every:
-            # A list is JSON in a cell.
-            writer.writerow(
-                [json.dumps(value) if isinstance(value, list) else value for value in row.values()]
-            )
-    elif as_json:
+    if as_json:
         sys.stdout.write('{"format_version": 1, "rows": [')
         end = "\n"
         for row in every:
@@ -203,7 +188,7 @@ def table(
         show.print_table(show.plain_table("", *(chosen.column_names if columns else _HEADINGS), rows=rows))
         is_whole = len(chosen) == len(rows)
         count = show.counted(len(chosen), "row")
-        show.note(count if is_whole else f"{len(rows)} of {count}; --csv and --json print all")
+        show.note(count if is_whole else f"{len(rows)} of {count}; --json prints all")
 
 
 def _summary(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -19,7 +19,6 @@ from lce_rig.core.errors import (
     CommandError,
     LceRigError,
     ResultRefusedError,
-    SessionError,
     TargetError,
 )
 from lce_rig.core.findings import Finding
@@ -57,7 +56,6 @@ from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
-from lce_rig.session.durable import copy_over
 
 _OTHER = "Another deployment came first. Run the same command again."
 
@@ -301,28 +299,12 @@ def _diff(name: str, deployed: Path, new: Path) -> list[str]:
 def _stage(
     result: Path, rig: Rig, target: TargetSettings, session: Session | None, folder: Path
 ) -> ResultFile:
-    """Write the files of the set: result.json, the exports, and further files of the target."""
+    """Write the files of the set: result.json and the exports."""
     saved = read_result(result / RESULT)
     folder.mkdir()
     # A failed result is one of the objections, which are decided on together.
     export(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
-    for pattern in target.files:
-        matching: list[Path] = []
-        is_there = False
-        with suppress(ValueError, IndexError, NotImplementedError):  # what pathlib raises for odd patterns
-            # Of the folder itself, and no links, which may lead out of it.
-            matching = [
-                path for path in result.glob(pattern) if path.parent == result and not path.is_symlink()
-            ]
-            is_there = any(folder.glob(pattern))
-        added = sorted(path for path in matching if not (folder / path.name).exists())
-        if not added and not is_there:
-            raise SessionError(
-                f"{result} has no file {pattern}", "Correct `files` of the target, or write the file first."
-            )
-        for path in added:
-            copy_over(path, folder / path.name)
     return saved
 
 

@@ -50,9 +50,6 @@ OUT_OF_MEMORY = Kind(
 SIGNAL = Kind(
     "fleet.signal", "its process was ended by signal {signal}: {what}", "calibrate the session alone"
 )
-EXITED = Kind(
-    "fleet.exited", "its process ended with exit code {code}: {what}", "calibrate the session alone"
-)
 WORKER_LOST = Kind(
     "fleet.worker_lost",
     "{n} workers were lost with it",

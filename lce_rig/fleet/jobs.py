@@ -15,8 +15,7 @@ from lce_rig.rig.loading import find_profile
 from lce_rig.session.identity import MARKER
 
 MANIFEST = "fleet.yaml"
-_FIELDS = ("robot", "collector", "site")
-_FIELD = re.compile(r"\{(\w+)\}")
+_ROBOT = "{robot}"
 _SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
@@ -29,15 +28,12 @@ class Job:
         robot: its name by the manifest; "" if that does not name it.
         fallback_robot: its name if the profile does not name it either: the first folder below the root.
         rig: profile that replaces the session's, or that a recording needs; "" for the session's.
-        collector, site: who collected it, and where; "" if unknown.
     """
 
     source: str
     robot: str = ""
     fallback_robot: str = ""
     rig: str = ""
-    collector: str = ""
-    site: str = ""
 
 
 class Entry(BaseModel):
@@ -48,36 +44,30 @@ class Entry(BaseModel):
     path: str = Field(min_length=1)
     robot: str = ""
     rig: str = ""
-    collector: str = ""
-    site: str = ""
 
     @field_validator("path")
     @classmethod
     def _is_a_pattern(cls, path: str) -> str:
-        parts, names = path.split("/"), _FIELD.findall(path)
+        parts = path.split("/")
         if path.startswith("/") or ".." in parts or "\0" in path:
             raise ValueError("not below the root")
         if any("**" in part and part != "**" for part in parts):
             raise ValueError("** beside other characters")
-        if len(names) > len(set(names) & set(_FIELDS)):
-            raise ValueError("fields are {robot}, {collector} and {site}, once each")
+        if "{" in path.replace(_ROBOT, "", 1):
+            raise ValueError("the only field is {robot}, once")
         return path
 
     @property
     def glob(self) -> str:
-        """The pattern without names of fields."""
-        return _FIELD.sub("*", self.path.rstrip("/"))
+        """The pattern without {robot}."""
+        return self.path.rstrip("/").replace(_ROBOT, "*")
 
-    def fields_of(self, path: str) -> dict[str, str]:
-        """Read the fields that the pattern names from a path that matches it."""
-        parts = re.split(r"(\{\w+\}|\*\*/|\*\*|\*|\?)", self.path.rstrip("/"))
-        rules = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-        pattern = "".join(
-            f"(?P<{part[1:-1]}>[^/]+?)" if _FIELD.fullmatch(part) else rules.get(part, re.escape(part))
-            for part in parts
-        )
-        match = re.fullmatch(pattern, path)
-        return {} if match is None else match.groupdict()
+    def robot_of(self, path: str) -> str:
+        """Return the robot that the entry names, or read it from a path that matches; "" without either."""
+        parts = re.split(r"(\{robot\}|\*\*/|\*\*|\*|\?)", self.path.rstrip("/"))
+        rules = {_ROBOT: "([^/]+?)", "**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+        match = re.fullmatch("".join(rules.get(part, re.escape(part)) for part in parts), path)
+        return self.robot or (match[1] if match is not None and match.groups() else "")
 
 
 def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
@@ -153,14 +143,10 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
             find_profile(rig)
         elif rig and not Storage(rig).exists():
             raise ProfileError(f"{manifest.url}: rig: {rig} does not exist", "Name a profile's file.")
-        stated = entry.model_dump(include=set(_FIELDS))
         for path in root.matching(entry.glob):
             if path not in jobs and path != MANIFEST:
-                read = entry.fields_of(path)
-                fields = {name: stated[name] or read.get(name, "") for name in _FIELDS}
-                jobs[path] = Job(
-                    f"{root.url}/{path}", fallback_robot=path.partition("/")[0], rig=rig, **fields
-                )
+                first, _, _ = path.partition("/")
+                jobs[path] = Job(f"{root.url}/{path}", entry.robot_of(path), first, rig)
     return list(jobs.values())
 
 

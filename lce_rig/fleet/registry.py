@@ -42,10 +42,8 @@ _MATRIX, _COVARIANCE = pa.list_(pa.float64(), 16), pa.list_(pa.float64(), 21)
 _UPPER = np.triu_indices(6)
 SESSION: Mapping[str, Any] = {
     **dict.fromkeys(("robot", "rig", "date", "folder", "source", "session_sha256", "profile_sha256"), _TEXT),
-    **dict.fromkeys(
-        ("program", "method", "status", "cause", "detail", "collector", "site", "finished"), _TEXT
-    ),
-    **dict.fromkeys(("duration_s", "cpu_s", "peak_memory_mb"), _FLOAT),
+    **dict.fromkeys(("program", "method", "status", "cause", "detail", "finished"), _TEXT),
+    "duration_s": _FLOAT,
 }
 """Columns of a session, and their types."""
 Select: TypeAlias = Callable[[Calibration, Mapping[str, str]], Any]

@@ -163,8 +163,7 @@ def run_job(job: Job, settings: Settings) -> list[Row]:
     order = {"job": asdict(job), "settings": asdict(settings)}
     limits = (settings.time_limit_s, settings.memory_limit_mb)
     ended = run_apart("lce_rig.fleet.work:work_order", order, *limits)
-    if ended.rows is not None:
-        return ended.rows
-    status, cause = ended.cause(*limits)
-    row = without_result(ended.known or first_row(job, settings), status, cause)
-    return publish(settings.opened(), [row], start_s, used=(ended.cpu_s, ended.peak_memory_mb))
+    if ended.rows is not None or ended.cause is None:
+        return ended.rows or []
+    row = without_result(ended.known or first_row(job, settings), ended.status, ended.cause)
+    return publish(settings.opened(), [row], start_s)

@@ -18,10 +18,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any
-
-import psutil  # type: ignore[import-untyped]
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import lce_rig as lce
 import lce_rig.fleet.findings as findings
@@ -138,8 +136,6 @@ def first_row(job: Job, settings: Settings) -> Row:
         "program": MADE_BY,
         "method": settings.method,
         "status": "ok",
-        "collector": job.collector or None,
-        "site": job.site or None,
     }
 
 
@@ -227,7 +223,6 @@ def publish(
     fill: Callable[[Path], None] = lambda _folder: None,
     *,
     saved: ResultFile | None = None,
-    used: tuple[float, float] | None = None,
 ) -> list[Row]:
     """Write a result's folder and return its rows.
 
@@ -237,16 +232,11 @@ def publish(
         start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
         saved: the result of the session; None if it has none.
-        used: processor time (s) and memory (MB) of the process that did the work; None for this one.
     """
     with registry.result(rows[0]["folder"]) as draft:
         fill(draft)
-        spent_here = resource.getrusage(resource.RUSAGE_SELF)
-        cpu_s, memory_mb = used or (spent_here.ru_utime + spent_here.ru_stime, spent_here.ru_maxrss / 1024)
         spent = {
             "duration_s": round(time.monotonic() - start_s, 3),
-            "cpu_s": round(cpu_s, 3),
-            "peak_memory_mb": round(memory_mb, 1),
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
         }
         rows = [row | spent for row in rows]
@@ -256,45 +246,29 @@ def publish(
     return [row | {"is_new": True} for row in rows]
 
 
-_POLL_S = 0.1
+_WATCH_S = 0.5
 _DETAIL_BYTES = 2000
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )
+# OpenCV has an error of its own for it, C++ one that Python does not know.
+_WITHOUT_MEMORY = ("MemoryError", "Insufficient memory", "bad_alloc")
 
 
-@dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     """The end of a session's process.
 
     Attributes:
         rows: its return value; None if it ended before.
         known: the last row that it sent before it ended.
-        exit_code: of the process; negative for a signal.
-        reason: "timed_out", "out_of_memory" or "bug" if that is known; else "".
-        detail: the last line that it printed.
-        cpu_s, peak_memory_mb: used by it.
+        status: "ok" with rows.
+        cause: why there are none.
     """
 
-    rows: list[dict[str, Any]] | None
-    known: dict[str, Any]
-    exit_code: int
-    reason: str
-    detail: str
-    cpu_s: float
-    peak_memory_mb: float
-
-    def cause(self, time_limit_s: float, memory_limit_mb: float) -> tuple[Status, Finding]:
-        """Say why there are no rows, as a status and a finding."""
-        if self.reason == "timed_out":
-            return "timed_out", findings.TIMED_OUT(limit_s=time_limit_s)
-        if self.reason == "out_of_memory" or "std::bad_alloc" in self.detail:  # C++ without memory
-            return "out_of_memory", findings.OUT_OF_MEMORY(limit_mb=memory_limit_mb)
-        if self.reason == "bug":
-            return "crashed", findings.BUG(what=self.detail)
-        if self.exit_code < 0:
-            return "crashed", findings.SIGNAL(signal=-self.exit_code, what=self.detail)
-        return "crashed", findings.EXITED(code=self.exit_code, what=self.detail)
+    rows: list[Row] | None
+    known: Row
+    status: Status = "ok"
+    cause: Finding | None = None
 
 
 def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memory_limit_mb: float) -> Ended:
@@ -304,91 +278,67 @@ def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memo
         call: "module:function"; it gets the arguments, and a function `tell` that sends a row early.
         arguments: JSON values.
         time_limit_s: after which the process is ended.
-        memory_limit_mb: resident memory beyond which it is.
+        memory_limit_mb: of data, beyond which its allocations fail.
     """
     order = {"call": call, "arguments": dict(arguments), "memory_limit_mb": memory_limit_mb}
-    with TemporaryFile() as messages, TemporaryFile() as errors:
-        process = subprocess.Popen(
+    try:
+        done = subprocess.run(
             [sys.executable, "-c", "from lce_rig.fleet.work import main; main()"],
-            stdin=subprocess.PIPE,
-            stdout=messages,
-            stderr=errors,
+            input=json.dumps(order).encode(),
+            capture_output=True,
+            timeout=time_limit_s,
             env=os.environ | _ONE_THREAD,
             start_new_session=True,
+            check=False,
         )
-        assert process.stdin is not None
-        reason, deadline_s = "", time.monotonic() + time_limit_s
-        try:
-            with suppress(BrokenPipeError):
-                process.stdin.write(json.dumps(order).encode() + b"\n")
-                process.stdin.flush()
-            while True:
-                pid, status, used = os.wait4(process.pid, os.WNOHANG)
-                if pid:
-                    break
-                with suppress(psutil.Error):
-                    if time.monotonic() > deadline_s:
-                        reason = "timed_out"
-                    elif psutil.Process(process.pid).memory_info().rss > memory_limit_mb * 1e6:
-                        reason = "out_of_memory"
-                if reason:
-                    os.killpg(process.pid, signal.SIGKILL)
-                time.sleep(_POLL_S)
-            process.returncode = os.waitstatus_to_exitcode(status)
-        finally:
-            with suppress(BrokenPipeError):
-                process.stdin.close()  # ends the process, if this one is interrupted
-        known: dict[str, Any] = {}
-        for line in _content(messages).splitlines():
-            with suppress(ValueError):  # a line that a kill cut short
-                known |= json.loads(line)
-        words = _content(errors)[-_DETAIL_BYTES:].decode(errors="replace").strip().splitlines()
+    except subprocess.TimeoutExpired as error:
         return Ended(
-            known.get("rows"),
-            known.get("known", {}),
-            process.returncode,
-            reason or known.get("reason", ""),
-            words[-1] if words else "",
-            used.ru_utime + used.ru_stime,
-            used.ru_maxrss / 1024,
+            None, _sent(error.stdout or b"")[0], "timed_out", findings.TIMED_OUT(limit_s=time_limit_s)
         )
+    known, rows = _sent(done.stdout)
+    if rows is not None:
+        return Ended(rows, known)
+    words = done.stderr[-_DETAIL_BYTES:].decode(errors="replace").strip()
+    detail = words.rpartition("\n")[2]
+    if any(sign in words for sign in _WITHOUT_MEMORY):
+        return Ended(None, known, "out_of_memory", findings.OUT_OF_MEMORY(limit_mb=memory_limit_mb))
+    if done.returncode < 0:
+        return Ended(None, known, "crashed", findings.SIGNAL(signal=-done.returncode, what=detail))
+    return Ended(None, known, "crashed", findings.BUG(what=detail))
 
 
-def _content(file: IO[bytes]) -> bytes:
-    file.seek(0)
-    return file.read()
+def _sent(output: bytes) -> tuple[Row, list[Row] | None]:
+    """Read the last row that a process sent early, and its rows; None if it ended before."""
+    sent: dict[str, Any] = {}
+    for line in output.splitlines():
+        with suppress(ValueError):  # a line that a kill cut short
+            sent |= json.loads(line)
+    return sent.get("known", {}), sent.get("rows")
 
 
 def main() -> None:
-    """Run the function that stdin names in this process, which ends with it or when stdin is closed."""
+    """Run the function that stdin names in this process, which ends with it or with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    order = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(1)), daemon=True).start()
+    order, parent = json.load(sys.stdin), os.getppid()
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     # Messages get a descriptor of their own: libraries print to stdout.
     messages = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     module, _, name = order["call"].partition(":")
     function = getattr(importlib.import_module(module), name)
-    # One large allocation fails, which would fill the memory faster than the other process looks.
-    limit = psutil.Process().memory_info().vms + int(order["memory_limit_mb"] * 1e6)
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(
-        resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard)
-    )
+    limit, hard = int(order["memory_limit_mb"] * 1e6), resource.getrlimit(resource.RLIMIT_DATA)[1]
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard < 0 else min(limit, hard), hard))
     try:
         rows = function(order["arguments"], lambda row: print(json.dumps({"known": row}), file=messages))
-        message: dict[str, Any] = {"rows": rows}
-    except BaseException as error:
-        causes = [error]
-        while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
-            causes.append(cause)
-        # OpenCV has an error of its own, C++ one that Python does not know.
-        is_of_memory = any(
-            isinstance(cause, MemoryError) or "Insufficient memory" in str(cause) or "bad_alloc" in str(cause)
-            for cause in causes
-        )
-        message = {"reason": "out_of_memory" if is_of_memory else "bug"}
+        print(json.dumps({"rows": rows}), file=messages, flush=True)
+        os._exit(0)
+    except BaseException:
         traceback.print_exc()
-    print(json.dumps(message), file=messages, flush=True)
-    sys.stderr.flush()
-    os._exit(0 if "rows" in message else 1)
+        sys.stderr.flush()
+        os._exit(1)

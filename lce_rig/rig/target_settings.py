@@ -64,7 +64,6 @@ class TargetSettings(Settings):
             {robot} in it stands for the robot's name.
         robot: the robot there; results of another one are refused.
         formats: export formats; None for the profile's `exports`, else the usual ones.
-        files: further files of the result's folder, as patterns such as `report.html`.
         run: a command to run there afterwards, by sh; $1 is the robot's name.
         run_timeout_s: time that it may take.
         ssh: options of ssh_config for the connection, such as Port and IdentityFile.
@@ -74,7 +73,6 @@ class TargetSettings(Settings):
     to: Text
     robot: RobotName | None = None
     formats: Annotated[tuple[OutputFormat, ...], Field(min_length=1, max_length=64)] | None = None
-    files: Annotated[tuple[Text, ...], Field(max_length=64)] = ()
     run: Text | None = None
     run_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 60.0
     ssh: Annotated[dict[SshOption, Text | int], Field(max_length=32)] = Field(default_factory=dict)

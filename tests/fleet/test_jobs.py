@@ -22,7 +22,7 @@ def test_every_session_is_found_once_and_named_after_the_first_folder(tmp_path):
     assert (job.source, job.fallback_robot) == (f"{tmp_path}/c", "c")
 
 
-def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
+def test_a_manifest_names_robot_and_profile_by_patterns(tmp_path):
     lay_out(tmp_path, "hall/r1/a", "hall/r2/b", "yard/r1/c")
     (tmp_path / "bags").mkdir()
     (tmp_path / "bags/r7.bag").write_bytes(b"")
@@ -30,15 +30,13 @@ def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
     (tmp_path / "profiles/r.yaml").write_text("name: r")
     (tmp_path / "fleet.yaml").write_text(
         "sessions:\n"
-        "  - {path: 'hall/{robot}/*', collector: Ann, site: hall 3}\n"
-        "  - {path: '{site}/r1/*', robot: r1}\n"
+        "  - {path: 'hall/{robot}/*'}\n"
+        "  - {path: '*/r1/*', robot: r1}\n"
         "  - {path: 'bags/{robot}.bag', rig: profiles/r.yaml}\n"
     )
     jobs = {job.source.removeprefix(f"{tmp_path}/"): job for job in find_jobs(Storage.at(tmp_path))}
     assert set(jobs) == {"hall/r1/a", "hall/r2/b", "yard/r1/c", "bags/r7.bag"}
     assert [jobs[name].robot for name in sorted(jobs)] == ["r7", "r1", "r2", "r1"]
-    assert (jobs["hall/r2/b"].collector, jobs["hall/r2/b"].site) == ("Ann", "hall 3")
-    assert jobs["yard/r1/c"].site == "yard"
     assert jobs["bags/r7.bag"].rig == f"{tmp_path}/profiles/r.yaml"
 
 
@@ -69,7 +67,7 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
 
 def test_entries_without_a_robot_are_named_by_their_first_folder(tmp_path):
     lay_out(tmp_path, "r1/a", "b")
-    (tmp_path / "fleet.yaml").write_text("sessions: [{path: '**/*'}, {path: '*', site: hall}]")
+    (tmp_path / "fleet.yaml").write_text("sessions: [{path: '**/*'}, {path: '*'}]")
     jobs = {job.source.removeprefix(f"{tmp_path}/"): job for job in find_jobs(Storage.at(tmp_path))}
     assert jobs["b"].fallback_robot == "b" and jobs["r1/a"].fallback_robot == "r1"
 

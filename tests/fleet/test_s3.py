@@ -54,7 +54,7 @@ def files_of(place):
         if name.endswith("fleet.json"):
             document = json.loads(data)
             for row in document["rows"]:
-                for key in ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source"):
+                for key in ("duration_s", "finished", "source"):
                     row.pop(key)
             data = json.dumps(document).encode()
         if name != TABLE:

@@ -25,9 +25,7 @@ def recorded(simulated, small_rig, tmp_path):
             shutil.copy(capture.path / "cam.frames.png", root / "hall3/r9/img" / f"{capture.name}.png")
             shutil.copy(capture.path / "lidar.pcd", root / "hall3/r9/pcd" / f"{capture.name}.pcd")
     (root / "profile.yaml").write_text(dump_rig(small_rig))
-    (root / "fleet.yaml").write_text(
-        'sessions:\n  - path: "hall3/{robot}"\n    rig: profile.yaml\n    site: hall 3\n'
-    )
+    (root / "fleet.yaml").write_text('sessions:\n  - path: "hall3/{robot}"\n    rig: profile.yaml\n')
     return root
 
 
@@ -45,5 +43,5 @@ def test_a_recording_is_calibrated_by_a_cluster_that_runs_already(recorded, caps
         address = running.scheduler_address
         assert run([*words, "--scheduler", address]) == 0
     (row,) = Registry(Storage.at(tmp_path / "registry")).read_table().to_pylist()
-    assert (row["status"], row["robot"], row["site"], row["n_used"]) == ("ok", "r9", "hall 3", 8)
+    assert (row["status"], row["robot"], row["n_used"]) == ("ok", "r9", 8)
     assert run([*words, "--scheduler", address]) == 5

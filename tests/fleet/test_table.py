@@ -12,10 +12,10 @@ from lce_rig.fleet.registry import as_table, read_table
 
 def test_a_column_that_an_earlier_version_did_not_write_is_null(tmp_path, row):
     path = tmp_path / "t.parquet"
-    pq.write_table(as_table([row()]).drop_columns(["site", "cpu_s"]), path)
+    pq.write_table(as_table([row()]).drop_columns(["detail", "mpe_m"]), path)
     (document,) = read_table(path).to_pylist()
-    assert document["site"] is None and document["cpu_s"] is None and document["robot"] == "r1"
-    assert read_table(path, ["robot", "site"]).column_names == ["robot", "site"]
+    assert document["detail"] is None and document["mpe_m"] is None and document["robot"] == "r1"
+    assert read_table(path, ["robot", "detail"]).column_names == ["robot", "detail"]
 
 
 def test_other_files_are_refused(tmp_path):
