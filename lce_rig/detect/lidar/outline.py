@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.segments import Indices
 from lce_rig.detect.lidar.template import Placement
 
 N_ANGLES = 9
@@ -47,8 +48,8 @@ class Rays:
     uv: Array
     is_on: NDArray[np.bool_]
 
-    def select(self, keep: NDArray[np.bool_]) -> "Rays":
-        """Keep the rays of a mask (M,)."""
+    def select(self, keep: NDArray[np.bool_] | Indices) -> "Rays":
+        """Keep the rays of a mask (M,) or index."""
         return Rays(self.uv[keep], self.is_on[keep])
 
 
@@ -64,6 +65,16 @@ class Outline(NamedTuple):
     placement: Placement
     growth_m: Array
     cov: Array
+
+
+def thin(n: int, most: int) -> Indices:
+    """Choose about `most` of n returns at random, the same ones each time, or all of fewer.
+
+    At even steps, they would be those of some of a LiDAR's lines, which recur in order and err alike.
+    """
+    if n <= most:
+        return np.arange(n)
+    return np.flatnonzero(np.random.default_rng(0).random(n) < most / n)
 
 
 def fit_outline(
@@ -86,7 +97,7 @@ def fit_outline(
         The optimum, None if no ray is near the border.
     """
     rays = rays.select(np.abs(start.distance_m(rays.uv)) < _BAND_M + 3 * max(annealed_m))
-    rays = rays.select(np.arange(len(rays.uv)) % (1 + len(rays.uv) // _MOST_RAYS) == 0)
+    rays = rays.select(thin(len(rays.uv), _MOST_RAYS))
     expected = np.array([0.0, 0.0, 0.0, *growth_m[0]])
     x = expected + [start.u_m, start.v_m, start.angle_rad, 0.0, 0.0]
     half = np.array(start.half_m)
@@ -95,22 +106,22 @@ def fit_outline(
     for k in range(_ROUNDS):
         least = annealed_m[k] if k < len(annealed_m) else 0.0
         placement = Placement(x[0], x[1], x[2], (half[0] + x[3], half[1] + x[4]))
-        near = np.abs(placement.distance_m(rays.uv)) < max(_BAND_M, 3 * least)
+        local = placement.local(rays.uv)
+        near = np.abs(placement.beyond_m(local)) < max(_BAND_M, 3 * least)
         if np.count_nonzero(near & rays.is_on) < 10:
             return None
-        local = placement.local(rays.uv[near])
+        local = local[near]
         cosine, sine = np.cos(x[2]), np.sin(x[2])
         blur = np.maximum(blur_m(np.array([[cosine, sine], [-sine, cosine]])), least)
         p, slopes = _probability(local, half + x[3:], blur)
         is_on = rays.is_on[near]
         # By u, v, angle and growth; the shift is counted along the rectangle's axes.
-        by_x, by_y = slopes[:, 0] - slopes[:, 1], slopes[:, 2] - slopes[:, 3]
+        right, left, top, bottom = slopes
+        by_x, by_y = right - left, top - bottom
         turned = by_x * local[:, 1] - by_y * local[:, 0]
-        J = np.column_stack(
-            [-by_x, -by_y, turned, -(slopes[:, 0] + slopes[:, 1]), -(slopes[:, 2] + slopes[:, 3])]
-        )
-        score = J.T @ np.where(is_on, 1 / p, -1 / (1 - p)) - prior @ (x - expected)
-        information = J.T @ (J / (p * (1 - p))[:, None]) + prior
+        J = np.array([-by_x, -by_y, turned, -(right + left), -(top + bottom)])
+        score = J @ np.where(is_on, 1 / p, -1 / (1 - p)) - prior @ (x - expected)
+        information = J @ (J / (p * (1 - p))).T + prior
         step = np.linalg.solve(information + 1e-3 * np.eye(5), score)
         step *= min(1.0, 0.05 / max(float(np.abs(step[:2]).max()), 1e-9))
         x = x + [cosine * step[0] - sine * step[1], sine * step[0] + cosine * step[1], *step[2:]]
@@ -132,7 +143,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
     """
     radius_m = 1.25 * float(np.hypot(*half_m))
     about = rays.select((rays.uv**2).sum(axis=1) < radius_m**2)
-    few = about.select(np.arange(len(about.uv)) % (1 + len(about.uv) // _FEW_RAYS) == 0)
+    few = about.select(thin(len(about.uv), _FEW_RAYS))
     placements = []
     for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
         start = Placement(0.0, 0.0, float(angle), half_m)
@@ -162,7 +173,7 @@ def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]
     """
     placement = outline.placement
     near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
-    near = near.select(np.arange(len(near.uv)) % (1 + len(near.uv) // _SMEAR_RAYS) == 0)
+    near = near.select(thin(len(near.uv), _SMEAR_RAYS))
     local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
     cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
     beam_m = blur_m(np.array([[cosine, sine], [-sine, cosine]]))
@@ -174,18 +185,19 @@ def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]
 
 
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
-    """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (M, 4) by each distance s_e.
+    """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (4, M) by each distance s_e.
 
     Sides are right, left, top and bottom.
     """
     from scipy.special import ndtr
 
-    beyond = np.column_stack([local[:, 0], -local[:, 0], local[:, 1], -local[:, 1]]) - half[[0, 0, 1, 1]]
-    z = -beyond / blur[[0, 0, 1, 1]]
+    x, y = local.T
+    half, blur = half[[0, 0, 1, 1], None], blur[[0, 0, 1, 1], None]
+    z = (half - [x, -x, y, -y]) / blur
     factors = ndtr(z)
-    inside = factors.prod(axis=1)
-    density = np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * blur[[0, 0, 1, 1]])
-    slopes = -(1 - 2 * _OUTLIERS) * inside[:, None] * density / np.maximum(factors, 1e-12)
+    inside = factors[0] * factors[1] * factors[2] * factors[3]
+    density = np.exp(-0.5 * z * z) / (np.sqrt(2 * np.pi) * blur)
+    slopes = -(1 - 2 * _OUTLIERS) * inside * density / np.maximum(factors, 1e-12)
     return _OUTLIERS + (1 - 2 * _OUTLIERS) * inside, slopes
 
 

@@ -88,7 +88,11 @@ class Placement:
 
     def distance_m(self, uv: Array) -> Array:
         """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
-        over = np.abs(self.local(uv)) - self.half_m
+        return self.beyond_m(self.local(uv))
+
+    def beyond_m(self, local: Array) -> Array:
+        """Measure the distance of points (..., 2) in the rectangle's axes from the border."""
+        over = np.abs(local) - self.half_m
         return _distance_over(over[..., 0], over[..., 1])[0]
 
 

@@ -33,6 +33,7 @@ from lce_rig.detect.lidar.outline import (
     measure_smear,
     measure_strips,
     register_rays,
+    thin,
 )
 from lce_rig.detect.lidar.plates import Plates
 from lce_rig.detect.lidar.search import (
@@ -49,9 +50,9 @@ from lce_rig.detect.lidar.search import (
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD
 from lce_rig.detect.lidar.template import Placement, PlaneView, view_plane
 
-# Cells per short side of the board: of 7 cm for a plate of 0.76 m.
-_CELLS = 11.0
-# Accumulated point clouds hold millions of points: enough of them find the plates, all near one measure it.
+# Cells per short side of the board: of 6 cm for a plate of 0.63 m.
+_CELLS = 10.0
+# Accumulated point clouds hold millions of points: enough of them find the plates, and measure one.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
 # So many returns, or rays, find about where plane and outline are, before all of them locate them.
 _ROUGH = 6_000
@@ -100,7 +101,7 @@ def find_unstructured_boards(
     if len(index) == 0:
         return LIDAR_NO_RETURNS.refusal(n_points=len(points), min_range_m=limits.min_range_m)
     searched = index[range_m[index] <= limits.max_range_m]
-    searched = searched[:: 1 + len(searched) // _MOST_SEARCHED]
+    searched = searched[thin(len(searched), _MOST_SEARCHED)]
     patches = grow_patches(points[searched], min(board.width_m, board.height_m) / _CELLS)
     near = np.column_stack([points, scan.intensity])[index]
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
@@ -179,7 +180,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     if not flat.any():
         return Plates.none()
     flat &= thinnest < (2.0 * _NOISE_M) ** 2
-    i, j = pairs[flat[pairs[:, 0]] & flat[pairs[:, 1]]].T
+    i, j = pairs.take(np.flatnonzero(flat[pairs].all(axis=1)), axis=0).T
     of_i, of_j = normal.take(i, axis=0), normal.take(j, axis=0)
     apart = centres.take(j, axis=0) - centres.take(i, axis=0)
     joined = np.abs(np.einsum("ij,ij->i", of_i, of_j)) > _SAME_NORMAL
@@ -232,16 +233,21 @@ def _principal(sums: Array) -> tuple[Array, Array, Array]:
 
 def _sum_cells(points: Array, cell_m: float) -> Array:
     """Sum 1, p and p p^T of the points in each cell of space: (V, 13)."""
-    cells = np.floor(points / cell_m).astype(np.int64)
-    cells -= cells.min(axis=0)
-    extent = cells.max(axis=0) + 1
-    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    # Columns, each in one piece of memory, take half the time of rows.
+    columns = np.ascontiguousarray(points.T)
+    key = np.zeros(len(points), dtype=np.int64)
+    for column in columns:
+        cell = np.floor(column / cell_m).astype(np.int64)
+        cell -= cell.min()
+        key *= cell.max() + 1
+        key += cell
     order = np.argsort(key)
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    x, y, z = points.take(order, axis=0).T
-    columns = (np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
-    sums = np.stack([np.add.reduceat(column, starts) for column in columns], axis=1)
-    return sums[:, [0, 1, 2, 3, 4, 5, 6, 5, 7, 8, 6, 8, 9]]
+    key = key[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    x, y, z = columns.take(order, axis=1)
+    sums = [np.add.reduceat(of, starts) for of in (x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)]
+    count = np.diff(starts, append=len(key)).astype(np.float64)
+    return np.stack([count, *(sums[k] for k in (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8))], axis=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -363,10 +369,10 @@ def measure_unstructured(
     reach_m = 1.4 * float(np.hypot(*half_m)) + _SURROUND_M
     cosine = 1.0 / np.hypot(1.0, reach_m / distance_m)
     along = returns[:, :3] @ (centre / distance_m)
-    returns, along = returns[along > 0], along[along > 0]
-    returns = returns[along > cosine * np.linalg.norm(returns[:, :3], axis=1)]
-    returns = returns[:: 1 + len(returns) // _MOST_MEASURED]
-    view = _View.of(returns[:: 1 + len(returns) // _ROUGH], plane, centre, 4 * _NOISE_M, limits)
+    squared_m2 = np.einsum("ij,ij->i", returns[:, :3], returns[:, :3])
+    returns = returns[(along > 0) & (along**2 > cosine**2 * squared_m2)]
+    returns = returns[thin(len(returns), _MOST_MEASURED)]
+    view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * _NOISE_M, limits)
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
@@ -379,7 +385,7 @@ def measure_unstructured(
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
-        rays = rays.select(np.arange(len(rays.uv)) % (1 + len(rays.uv) // _ROUGH) == 0)
+        rays = rays.select(thin(len(rays.uv), _ROUGH))
         fits = (fit_outline(rays, start, view.blur_m, view.growth_m(start)) for start in starts)
         outline = min((fit for fit in fits if fit), key=lambda fit: fit.placement.error_m, default=None)
         inside = np.zeros(0) if outline is None else view.is_on & (outline.placement.distance_m(view.uv) < 0)
