@@ -135,11 +135,11 @@ def estimate_observations(
     """
     begin(progress, "Algorithm 1")
     start = solve(observations, board)
-    begin(progress, "uncertainty" if settings.method == "paper" else "maximum likelihood")
-    if settings.method == "paper":
-        return by_scatter(start, board, settings)
+    begin(progress, "maximum likelihood")
     priors, usual = what_is_known(settings)
     joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
+    if settings.method == "paper":
+        return by_scatter(start, joint, board, settings)
     return with_profile(by_likelihood(start, joint, board), joint, board, settings)
 
 

@@ -62,7 +62,7 @@ class CalibrationEstimate:
         cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
             cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
-            its standard deviation at usual noise; None if the method estimates no boards.
+            its standard deviation at usual noise, both by the likelihood; None without it.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.

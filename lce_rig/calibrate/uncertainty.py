@@ -29,11 +29,14 @@ _SURE = 2.0
 _STEP_M = 1e-3
 
 
-def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> CalibrationEstimate:
+def by_scatter(
+    start: Algorithm1, joint: JointEstimate, board: Board, settings: EstimateSettings
+) -> CalibrationEstimate:
     """Report Algorithm 1's solution: covariance from the scatter of captures, and from the LiDAR's errors.
 
     Args:
         start: the solution.
+        joint: estimate from it, of which the boards' turns are reported.
         board: its specification.
         settings: priors and tolerances.
     """
@@ -58,6 +61,7 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
         estimate,
         fitted={observation.capture: observation for observation in start.fitted},
         sensitivities=sensitivities,
+        turns=_turns(joint),
         lens=settings.lens,
     )
 
@@ -227,7 +231,7 @@ def with_profile(
     return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
 
 
-def _turns(joint: JointEstimate, camera: int) -> Array:
+def _turns(joint: JointEstimate, camera: int = 0) -> Array:
     """Measure the turn about its line of sight of each board that a camera sees: `CalibrationEstimate.turns`.
 
     The noise of such turns, as estimated, contains those of a sensor that moves to and fro, and captures of

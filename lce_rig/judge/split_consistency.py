@@ -52,11 +52,12 @@ _WIDER = 2.67
 # Groups below this share of the least chance count from one target on: none of 470 draws of 8 to 16 captures
 # from 24 sound sessions, 11 of them recorded, lies below it, and six below the least chance itself.
 _CERTAIN = 0.1
-
-
 # The gain of dividing n sorted normal variables at the best place, over n: 2 / pi and a little for the
 # choice (100,000 draws of 8 to 60; its variance is 1 / n).
 _MEAN_GAIN = 0.65
+# A sensor that moved is looked for before this many of the last turns and after as many of the first; without
+# the one that differs most, the others of that side differ from the rest at this chance.
+_MIN_END, _DIFFERS = 2, 0.05
 
 
 class RejectedGroup(NamedTuple):
@@ -244,11 +245,12 @@ def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
 
 
 def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, ...]:
-    """Look for two groups of boards turned differently about their lines of sight.
+    """Look for boards turned differently about their lines of sight: two groups, and before and after.
 
     A turn of the image moves ring ends along the edges, which their own cost tells more accurately than
     their distances. The turns, sorted, are divided where the weighted sum of squares falls most, by G. For n
-    turns of known noise and no groups, G has mean 0.65 n and variance n.
+    turns of known noise and no groups, G has mean 0.65 n and variance n. In order of time, each fall is
+    chi-squared with one degree of freedom.
 
     Args:
         turns: (2, F) angle of each capture, rad, and standard deviation.
@@ -256,32 +258,77 @@ def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, 
         groups: (n, F) 1 where a capture shows a placement, whose captures have the same error.
 
     Returns:
-        The smaller group compared with the rest; none for fewer than 8 placements.
+        The smaller group compared with the rest, and the captures before the largest change with those after
+        it; none for fewer than 8 placements.
     """
-    from scipy.special import chdtrc
-
-    n = len(groups)
-    if n < _MIN_GROUPED:
+    if len(groups) < _MIN_GROUPED:
         return ()
     shares = groups / groups.sum(axis=1, keepdims=True)
-    angles, weights = shares @ turns[0], 1 / (shares @ turns[1] ** 2)
-    order = np.argsort(angles)
-    w = weights[order]
-    off = w * (angles[order] - np.average(angles, weights=weights))
-    first, total = np.cumsum(w)[:-1], w.sum()
-    gains = np.cumsum(off)[:-1] ** 2 * (1 / first + 1 / (total - first))
-    least = max(_MIN_SHARE, int(np.ceil(_MIN_GROUP * n)))
-    cut = least + int(np.argmax(gains[least - 1 : n - least]))
-    # A gamma distribution of that mean and variance.
-    chance = float(chdtrc(2 * _MEAN_GAIN**2 * n, 2 * _MEAN_GAIN * gains[cut - 1]))
-    parts = order[:cut], order[cut:]
-    smaller, rest = parts if 2 * cut <= n else parts[::-1]
-    apart = [np.average(angles[part], weights=weights[part]) for part in (smaller, rest)]
     sight = centres.mean(axis=0) / np.linalg.norm(centres.mean(axis=0))
-    members = np.flatnonzero(groups[smaller].any(axis=0))
-    tangent = np.r_[np.zeros(3), (apart[0] - apart[1]) * sight]
-    group = tuple(members.tolist())
-    return (Contrast("group", "rest", tangent, chance, len(members), group, is_noise_known=True),)
+    boards = _Turns(shares @ turns[0], 1 / (shares @ turns[1] ** 2), sight)
+    return boards.groups(groups), boards.change(np.argmax(groups > 0, axis=1))
+
+
+class _Turns(NamedTuple):
+    """Boards of n placements turned about their lines of sight.
+
+    Attributes:
+        angles: (n,) rad.
+        weights: (n,) of these.
+        sight: (3,) the mean line of sight.
+    """
+
+    angles: Array
+    weights: Array
+    sight: Array
+
+    def groups(self, groups: Array) -> Contrast:
+        """Compare the smaller of the two groups (n, F) that differ most with the rest."""
+        from scipy.special import chdtrc
+
+        order, n = np.argsort(self.angles), len(self.angles)
+        cut, fall = self._divide(order, max(_MIN_SHARE, int(np.ceil(_MIN_GROUP * n))))
+        smaller, rest = sorted((order[:cut], order[cut:]), key=len)
+        # A gamma distribution of that mean and variance.
+        chance = float(chdtrc(2 * _MEAN_GAIN**2 * n, 2 * _MEAN_GAIN * fall))
+        members = tuple(np.flatnonzero(groups[smaller].any(axis=0)).tolist())
+        apart, _ = self._compare(smaller, rest)
+        return Contrast("group", "rest", apart, chance, len(members), members, is_noise_known=True)
+
+    def change(self, starts: NDArray[np.intp]) -> Contrast:
+        """Compare boards before and after the largest change, with the first capture (n,) of each."""
+        from scipy.special import chdtrc
+
+        order = np.argsort(starts)
+        cut, fall = self._divide(order, _MIN_END)
+        smaller, rest = sorted((order[:cut], order[cut:]), key=len)
+        # Beside an outlier, the others of its side agree with the rest.
+        others = (np.delete(smaller, k) for k in range(len(smaller)))
+        is_change = chdtrc(1, min(self._compare(each, rest)[1] for each in others)) < _DIFFERS
+        n_tried = len(order) + 1 - 2 * _MIN_END
+        chance = min(n_tried * float(chdtrc(1, fall)), 1.0) if is_change else 1.0
+        apart, _ = self._compare(order[:cut], order[cut:])
+        return Contrast("before", "after", apart, chance, int(starts[order[cut]]), is_noise_known=True)
+
+    def _divide(self, order: NDArray[np.intp], least: int) -> tuple[int, float]:
+        """Divide boards in an order where the weighted sum of squares falls most.
+
+        Returns:
+            How many come first, at least so many and at most all but those; how far the sum falls.
+        """
+        w = self.weights[order]
+        off = w * (self.angles[order] - np.average(self.angles, weights=self.weights))
+        first, total = np.cumsum(w)[:-1], w.sum()
+        falls = np.cumsum(off)[:-1] ** 2 * (1 / first + 1 / (total - first))
+        cut = least + int(np.argmax(falls[least - 1 : len(w) - least]))
+        return cut, float(falls[cut - 1])
+
+    def _compare(self, first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[Array, float]:
+        """Compare two subsets: tangent (6,) from the second to the first, its chi-squared."""
+        parts = [(self.angles[part], self.weights[part]) for part in (first, second)]
+        means = [np.average(angles, weights=weights) for angles, weights in parts]
+        apart_rad, variance = means[0] - means[1], sum(1 / weights.sum() for _, weights in parts)
+        return np.r_[np.zeros(3), apart_rad * self.sight], float(apart_rad**2 / variance)
 
 
 def _share_out(g: Array, H: Array, starts: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_], Array]:
@@ -343,25 +390,23 @@ def objections(
 ) -> list[Contrast]:
     """List the subsets that differ significantly and by more than their limit.
 
-    A change at one capture makes two groups, too, both searches for groups may find them, and a change seen
-    in rejected captures is seen in others: each is told once. Where boards at other places differ more
+    A change at one capture makes two groups, too, two searches each may find groups or a change, and a change
+    seen in rejected captures is seen in others: each is told once. Where boards at other places differ more
     significantly than earlier and later ones, a constant error of lens, board or ranges is the cause, and no
     sensor moved.
     """
-    found = [contrast for contrast in contrasts if contrast.excess(target, limits) > 1]
+    found = sorted((c for c in contrasts if c.excess(target, limits) > 1), key=lambda each: each.chance)
     by_place = min((each.chance for each in found if each.is_of_places), default=1.0)
     found = [
         each
         for each in found
         if each.rejected or not ((each.is_change and each.chance > by_place) or (each.group and by_place < 1))
     ]
-    moved = [contrast for contrast in found if contrast.rejected is not None]
-    has_changed = any(contrast.is_change for contrast in found)
-    if moved:
-        found = [*moved, *(each for each in found if not (each.is_change or each.rejected))]
-    groups = sorted((each for each in found if each.group), key=lambda each: each.chance)
-    told = [] if has_changed else groups[:1]
-    return [contrast for contrast in found if not contrast.group or contrast in told]
+    moved = [each for each in found if each.rejected]
+    changes = [each for each in found if each.is_change]
+    groups = [each for each in found if each.group and not changes]
+    told = [*(moved or changes)[:1], *groups[:1]]
+    return [each for each in contrasts if each in told or (each.is_of_places and each in found)]
 
 
 def split_findings(

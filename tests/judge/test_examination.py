@@ -181,8 +181,8 @@ def test_a_sensor_that_turns_to_and_fro_about_the_line_of_sight_is_told_and_clai
 def test_captures_of_one_placement_count_once_in_a_search_for_turns():
     angles = np.radians(np.tile([0.0, 0.4], 4))
     turns, centres = np.array([angles, np.full(8, np.radians(0.1))]), np.tile([0.0, 0.0, 3.0], (8, 1))
-    (once,) = find_turned(turns, centres, np.eye(8))
-    (twice,) = find_turned(
+    once, _ = find_turned(turns, centres, np.eye(8))
+    twice, _ = find_turned(
         np.repeat(turns, 2, axis=1), np.repeat(centres, 2, axis=0), np.repeat(np.eye(8), 2, axis=1)
     )
     assert once.chance < 0.001
@@ -192,15 +192,46 @@ def test_captures_of_one_placement_count_once_in_a_search_for_turns():
     assert tangent_sizes(once.apart)[0] == pytest.approx(0.4)
 
 
-def test_two_groups_are_named_in_few_sessions_with_turns_of_the_noise_that_is_stated():
+def test_groups_and_changes_are_named_in_few_sessions_with_turns_of_the_noise_that_is_stated():
     rng = np.random.default_rng(1)
-    chances = [
-        find_turned(np.array([rng.standard_normal(16), np.ones(16)]), np.ones((16, 3)), np.eye(16))[0].chance
+    found = [
+        find_turned(np.array([rng.standard_normal(16), np.ones(16)]), np.ones((16, 3)), np.eye(16))
         for _ in range(4000)
     ]
+    groups, changes = np.array([[each.chance for each in both] for both in found]).T
     for level in (0.1, 0.01, 0.001):
         n_expected = 4000 * level
-        assert abs(np.count_nonzero(np.less(chances, level)) - n_expected) < 4 * np.sqrt(n_expected)
+        assert abs(np.count_nonzero(groups < level) - n_expected) < 4 * np.sqrt(n_expected)
+        # Corrected for the number of captures tried as if they told different things.
+        assert np.count_nonzero(changes < level) < n_expected + 4 * np.sqrt(n_expected)
+
+
+@pytest.mark.parametrize(
+    ("turned", "cut"), [((14, 15), 14), ((0, 1), 2), ((9, 10, 11, 12, 13, 14, 15), 9), ((15,), None)]
+)
+def test_turns_tell_a_sensor_that_moved_at_a_capture_from_an_outlier(turned, cut):
+    angles = np.radians(np.tile([0.05, -0.05], 8))
+    angles[[*turned]] += np.radians(0.6)
+    turns, centres = np.array([angles, np.full(16, np.radians(0.12))]), np.tile([0.0, 0.0, 3.0], (16, 1))
+    _, change = find_turned(turns, centres, np.eye(16))
+    assert (change.chance < 0.001, change.n_first) == ((True, cut) if cut else (False, change.n_first))
+    if cut:
+        assert tangent_sizes(change.apart)[0] == pytest.approx(0.6, abs=0.1)
+
+
+@pytest.mark.parametrize("method", ["paper", "ml"])
+def test_a_sensor_turned_about_the_line_of_sight_before_the_last_two_captures_does_not_pass(method):
+    turn = perturb(np.eye(4), np.array([0, 0, 0, 0, 0, np.radians(0.8)]))
+    boards = [
+        moved(seen, turn @ seen.image.T_cam_board) if k >= 14 else seen
+        for k, seen in enumerate(observed(16, 2))
+    ]
+    estimate = fit_extrinsic(boards, BOARD, EstimateSettings(method))
+    validation = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
+    verdict, findings = judge(estimate, validation, RIG, "cam", "lidar", 16)
+    assert (verdict, findings[0].code) == ("fail", "verdict.changed")
+    off_rad = difference(estimate.T_cam_lidar, turn @ T_FORWARD)[5]
+    assert abs(off_rad) < 2 * np.sqrt(validation.cov[5, 5])
 
 
 def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
