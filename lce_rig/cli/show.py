@@ -14,7 +14,6 @@ from typing import Any
 import click
 
 from lce_rig.core.findings import Finding
-from lce_rig.rig.loading import dump_yaml
 
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
@@ -110,9 +109,42 @@ def print_json(document: Any) -> None:
 
 
 def print_figures(document: Any) -> None:
-    """Print every figure of a result for people, as YAML of what `print_json` prints, to five digits."""
+    """Print every figure of what `print_json` prints, for people: to five digits, like records as a table."""
     rounded = json.loads(_as_json(document), parse_float=lambda text: float(f"{float(text):.5g}"))
-    click.echo(dump_yaml(rounded), nl=False)
+    for line in _figure_lines(rounded):
+        click.echo(line.rstrip())
+
+
+def _figure_lines(document: Any, indent: str = "") -> Iterator[str]:
+    """Lay out a mapping or list, each level indented; records that hold no others become rows of a table."""
+
+    def text(value: Any) -> str:
+        return ", ".join(map(text, value)) if isinstance(value, list) else "" if value is None else str(value)
+
+    def holds(value: Any, kinds: Any) -> bool:
+        return any(isinstance(item, kinds) for item in (value.values() if isinstance(value, dict) else value))
+
+    named = document.items() if isinstance(document, dict) else [("-", item) for item in document]
+    records = [(str(name), value) for name, value in named]
+    is_table = len(records) > 1 and all(
+        isinstance(value, dict) and not holds(value, dict) and len(value) > 1 for _, value in records
+    )
+    if is_table:
+        keys = list(dict.fromkeys(key for _, value in records for key in value))
+        rows = [["", *keys], *([name, *(text(value.get(key)) for key in keys)] for name, value in records)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for row in rows:
+            yield indent + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        return
+    for name, value in records:
+        is_long = isinstance(value, list) and any(" " in item for item in value if isinstance(item, str))
+        if isinstance(value, dict) or (isinstance(value, list) and (is_long or holds(value, (dict, list)))):
+            yield f"{indent}{name}:"
+            yield from _figure_lines(value, indent + "  ")
+        else:
+            yield from textwrap.wrap(
+                f"{name}: {text(value)}", 100, initial_indent=indent, subsequent_indent=indent + "  "
+            )
 
 
 def _as_json(document: Any) -> str:
