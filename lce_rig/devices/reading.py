@@ -7,14 +7,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Generic, TypeVar
 
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.io.findings import LIDAR_UTC
 
 _RATE_WINDOW_S = 3.0
@@ -206,14 +204,6 @@ class LiveSource(ABC):
     @abstractmethod
     def describe(self) -> SourceStatus:
         """Report the state of the device, open or not; any thread may ask. Taken samples are counted here."""
-
-    def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
-        """Have what the device sends recorded as it comes, from opening on; False where it sends no packets.
-
-        Raises:
-            SourceError: the file exists already, or cannot be made.
-        """
-        return False
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Explain a silence of `silence_s` since the device was opened or last sent."""

@@ -17,16 +17,14 @@ import struct
 import threading
 import time
 from collections import Counter
-from pathlib import Path
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource, SourceStatus
-from lce_rig.io.network import Datagram, PcapWriter
+from lce_rig.io.network import Datagram
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
@@ -72,28 +70,11 @@ class Vlp16Source(LiveSource):
         self._port = settings.driver.port or velodyne.DATA_PORT
         self._lock = threading.Lock()
         self._stream: Vlp16Stream | None = None
-        self._recorder: Sink[Datagram] | None = None
         self._ports: tuple[UdpPort, ...] = ()
         self._early: list[Scan] = []
         self._address = ""
         self._strangers: Counter[str] = Counter()
         self._n_lost_before = 0
-
-    def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
-        """Have all packets written to SENSOR.pcap.
-
-        Raises:
-            SourceError: the file exists already, or cannot be made.
-        """
-        path = folder / f"{self.sensor}.pcap"
-        try:
-            writer = PcapWriter(path)
-        except FileExistsError:
-            raise SourceError(f"{path} exists already", "Move it away, or record elsewhere.") from None
-        except OSError as error:
-            raise SourceError(f"{path} cannot be written: {error.strerror}") from None
-        self._recorder = disk.add(path, writer.write, writer.close)
-        return True
 
     def open(self) -> None:
         """Open the ports and wait for the first packet.
@@ -156,8 +137,6 @@ class Vlp16Source(LiveSource):
             state = stream.clock.state()
             problems = [] if state.severity == "note" else [state]
             problems += self._find_losses(stream, ports)
-            if self._recorder is not None:
-                problems += self._recorder.findings()
             return SourceStatus(
                 self.sensor,
                 n_lost=stream.losses.n("packet.lost") + self._n_lost_before,
@@ -197,8 +176,6 @@ class Vlp16Source(LiveSource):
         if self._address and datagram.source != self._address:
             self._strangers[datagram.source] += 1
             return None
-        if self._recorder is not None:
-            self._recorder.put(datagram, len(datagram.payload))
         with self._lock:
             if not is_data:
                 stream.push_position(datagram.payload)

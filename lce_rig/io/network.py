@@ -1,13 +1,12 @@
-"""UDP datagrams in recordings of a network (pcap, pcapng), read and written by dpkt."""
+"""UDP datagrams in recordings of a network (pcap, pcapng), read by dpkt."""
 
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import dpkt  # type: ignore[import-untyped]
 
@@ -17,13 +16,10 @@ from lce_rig.io import findings
 from lce_rig.rig import DriverSettings
 
 _NS_PER_S = 1_000_000_000
-_MAX_FRAME_BYTES = 65535
 FRAME_BYTES = 58
 """Of a recorded datagram beside its payload: headers of pcap, Ethernet, IP and UDP."""
 # So many packets, per second or less of one sensor, show which sensors were recorded.
 _N_SURVEYED, _MAX_SHOWN = 800, 6
-# The sensor's own maker; what the sensor broadcasts goes to every card.
-_SENSOR_CARD, _EVERY_CARD = bytes.fromhex("607688000000"), b"\xff" * 6
 # Class of a frame by link type, https://www.tcpdump.org/linktypes.html.
 _FRAMES: dict[int, Any] = {
     0: dpkt.loopback.Loopback,
@@ -152,52 +148,3 @@ class PcapFile:
         return Datagram(
             host_ns, socket.inet_ntoa(ip.src), udp.sport, udp.dport, bytes(udp.data[: udp.ulen - 8])
         )
-
-
-def build_frame(datagram: Datagram) -> bytes:
-    """Build the Ethernet frame of a datagram that was broadcast, as the sensor sends it when new."""
-    udp = dpkt.udp.UDP(
-        sport=datagram.source_port, dport=datagram.port, ulen=8 + len(datagram.payload), data=datagram.payload
-    )
-    ip = dpkt.ip.IP(
-        src=socket.inet_aton(datagram.source), dst=b"\xff" * 4, p=dpkt.ip.IP_PROTO_UDP, df=1, data=udp
-    )
-    return bytes(dpkt.ethernet.Ethernet(src=_SENSOR_CARD, dst=_EVERY_CARD, data=bytes(ip)))
-
-
-class PcapWriter(AbstractContextManager["PcapWriter"]):
-    """A pcap file that tcpdump, Wireshark and VeloView open, with arrivals in ns; a context manager.
-
-    Every second it is handed to the operating system. Torn off anywhere, it is read up to there.
-
-    Raises:
-        FileExistsError: the file is there already.
-        OSError: it cannot be written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file: BinaryIO = path.open("xb")
-        self._writer = dpkt.pcap.Writer(self._file, snaplen=_MAX_FRAME_BYTES, nano=True)
-        self._flushed_ns = 0
-
-    def write(self, datagram: Datagram) -> None:
-        """Append a datagram.
-
-        Raises:
-            OSError: it cannot be written; the disk may be full.
-        """
-        self._writer.writepkt_time(build_frame(datagram), Decimal(datagram.host_ns).scaleb(-9))
-        if datagram.host_ns - self._flushed_ns > _NS_PER_S:
-            self._file.flush()
-            self._flushed_ns = datagram.host_ns
-
-    def close(self) -> None:
-        """Write what waits, and close the file.
-
-        Raises:
-            OSError: it cannot be written; the disk may be full.
-        """
-        self._file.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -13,14 +13,11 @@ from wire.vlp16_packets import SensorPacket, free_ports
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16 import UdpPort, Vlp16Source
-from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.attached import attached
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settings
-from tests.shared import changed, files_up_to, wait_until
+from tests.shared import changed, wait_until
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
 PATIENT_S = 10.0
@@ -86,14 +83,11 @@ class Sender:
 
 
 @contextmanager
-def streaming(lidar, make_packets, record_to=None, **options):
+def streaming(lidar, make_packets, **options):
     """An open source that packets come to, and its samples."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": PATIENT_S, **options})
-    with DiskWriter() as disk:
-        if record_to is not None:
-            assert source.record_packets(record_to, disk)
-        with Sender(lidar, source).sending(make_packets), attached(source) as opened:
-            yield opened
+    with Sender(lidar, source).sending(make_packets), attached(source) as opened:
+        yield opened
 
 
 class Room:
@@ -209,36 +203,6 @@ def test_a_port_that_another_program_holds_is_named(lidar):
         other.bind(("", lidar.driver.port))
         error = explain(lidar)
     assert str(lidar.driver.port) in error.what and "ss -ulpn" in error.hint
-
-
-# What is kept
-
-
-def test_what_was_recorded_replays_to_the_same_scans(lidar, rig, tmp_path):
-    path = tmp_path / "lidar.pcap"
-    with streaming(lidar, Room(6), record_to=tmp_path) as (_, samples):
-        live = take(samples, 5)
-    replayed = list(PcapRecording(path, rig, SourceOptions()).samples())[:5]
-    for a, b in zip(live, replayed, strict=True):
-        assert (a.stamp_ns, a.host_ns) == (b.stamp_ns, b.host_ns)
-        np.testing.assert_array_equal(a.points, b.points)
-        np.testing.assert_array_equal(a.offset_ns, b.offset_ns)
-
-
-def test_a_recording_is_never_written_over(lidar, tmp_path):
-    path = tmp_path / "lidar.pcap"
-    path.write_bytes(b"kept")
-    with DiskWriter() as disk, pytest.raises(SourceError) as caught:
-        Vlp16Source("lidar", lidar).record_packets(tmp_path, disk)
-    assert str(path) in caught.value.what
-    assert path.read_bytes() == b"kept"
-
-
-def test_a_full_disk_ends_the_recording_and_nothing_else(lidar, tmp_path):
-    with files_up_to(200_000), streaming(lidar, Room(6), record_to=tmp_path) as (source, samples):
-        scans = take(samples, 5)
-        wait_until(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
-    assert len(scans) == 5
 
 
 # What is said

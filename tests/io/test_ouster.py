@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.network import Datagram, PcapWriter
+from lce_rig.io.network import Datagram
 from lce_rig.io.ouster import PROFILES, OusterRecording, read_metadata
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.rig import load_rig
 from tests.damage import damaged
+
+from .pcap_files import write_datagrams
 
 KEPT = np.load(Path(__file__).parent / "ouster_packets.npz")
 DOCUMENT = json.loads(KEPT["meta"].tobytes())
@@ -69,24 +71,25 @@ def test_metadata_in_groups_as_newer_sensors_write_them_are_the_same(tmp_path):
 
 def write_pcap(path, metadata, n_frames, range_m=4.0):
     """Record whole frames of a sensor in the middle of a sphere."""
+    datagrams = []
     profile = PROFILES[metadata.name]
     per, step_ns = metadata.columns_per_packet, 10**8 // metadata.n_columns
-    with PcapWriter(path) as writer:
-        for k in range(round(n_frames * metadata.n_columns / per)):
-            packet = np.zeros((), metadata.packet)
-            number = k * per + np.arange(per)
-            packet["columns"]["ns"] = T0_NS + step_ns * number
-            packet["columns"]["column"] = number % metadata.n_columns
-            packet["columns"]["status"] = 1
-            packet["columns"]["pixels"]["range"] = round(range_m / profile.unit_m)
-            packet["columns"]["pixels"]["reflectivity"] = 60
-            frame = k * per // metadata.n_columns
-            if profile.has_heads:
-                packet["frame"] = frame
-            else:
-                packet["columns"]["frame"] = frame
-            arrived_ns = T0_NS + step_ns * per * (k + 1) + 50_000
-            writer.write(Datagram(arrived_ns, "169.254.1.2", 50_000, 7502, packet.tobytes()))
+    for k in range(round(n_frames * metadata.n_columns / per)):
+        packet = np.zeros((), metadata.packet)
+        number = k * per + np.arange(per)
+        packet["columns"]["ns"] = T0_NS + step_ns * number
+        packet["columns"]["column"] = number % metadata.n_columns
+        packet["columns"]["status"] = 1
+        packet["columns"]["pixels"]["range"] = round(range_m / profile.unit_m)
+        packet["columns"]["pixels"]["reflectivity"] = 60
+        frame = k * per // metadata.n_columns
+        if profile.has_heads:
+            packet["frame"] = frame
+        else:
+            packet["columns"]["frame"] = frame
+        arrived_ns = T0_NS + step_ns * per * (k + 1) + 50_000
+        datagrams.append(Datagram(arrived_ns, "169.254.1.2", 50_000, 7502, packet.tobytes()))
+    write_datagrams(path, datagrams)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

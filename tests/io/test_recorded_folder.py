@@ -8,26 +8,32 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import list_parts, open_recordings
 from lce_rig.io.joining import check_overlap, join_recordings
-from lce_rig.io.network import Datagram, PcapWriter
+from lce_rig.io.network import Datagram
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.ros.bag_recorder import BagRecorder
 
+from .pcap_files import write_datagrams
 from .rig_samples import KINDS, T0_NS, one_second
 from .vlp16_room import NETWORK_NS, packets_of, room_scans
 
 
+def record_packets(path):
+    packets = packets_of(room_scans(10, T0_NS))
+    write_datagrams(
+        path,
+        (Datagram(p.sent_ns + NETWORK_NS, "127.0.0.1", p.port, p.port, p.payload) for p in packets),
+    )
+
+
 def fill(folder, rig, ros=1):
-    """Record a second as `collect --record` does: packets apart, all else in a bag."""
+    """Record a second: packets by one recorder, all else in a bag."""
     n_pictures = 0
     with BagRecorder.in_folder(folder, rig, ros) as recorder:
         for sample in one_second():
             if not isinstance(sample, Scan):
                 recorder.write(sample)
                 n_pictures += isinstance(sample, Image)
-    with PcapWriter(folder / "lidar.pcap") as packets:
-        for sent in packets_of(room_scans(10, T0_NS)):
-            arrival_ns = sent.sent_ns + NETWORK_NS
-            packets.write(Datagram(arrival_ns, "127.0.0.1", sent.port, sent.port, sent.payload))
+    record_packets(folder / "lidar.pcap")
     return n_pictures
 
 
@@ -113,10 +119,7 @@ def fill_with_pictures(folder, place="webcam", n=5, torn=None):
         cv2.imwrite(str(file), np.full((72, 128), 10 + k, np.uint8))
         if k == torn:
             file.write_bytes(file.read_bytes()[:100])
-    with PcapWriter(folder / "lidar.pcap") as packets:
-        for sent in packets_of(room_scans(10, T0_NS)):
-            arrival_ns = sent.sent_ns + NETWORK_NS
-            packets.write(Datagram(arrival_ns, "127.0.0.1", sent.port, sent.port, sent.payload))
+    record_packets(folder / "lidar.pcap")
 
 
 @pytest.mark.parametrize("paths", [["."], ["lidar.pcap", "webcam"], ["webcam", "lidar.pcap"]])

@@ -17,7 +17,6 @@ from lce_rig.core.calibration import MOTIONS, ResultFile, read_result
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
-from lce_rig.io.network import build_frame
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.pipeline.watch_drift import SceneCaptures, Thinned, drift
 from lce_rig.rig import Rig, dump_rig
@@ -25,7 +24,8 @@ from lce_rig.session import Session
 from lce_rig.timing.scan_pairing import EventCut, Frame
 from tests.doctor.attached import Attached, attach
 from tests.io.events.aedat4_files import RawFrame, write_davis
-from tests.io.test_pcap import to_datagram, write_pcap
+from tests.io.pcap_files import write_datagrams
+from tests.io.test_pcap import to_datagram
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of
 from tests.saved_results import write_result
 
@@ -207,8 +207,8 @@ def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp
         RawFrame((t + PERIOD_NS // 2) // 1000 - 2000, 4000, capture.images[0].grey)
         for capture, t in zip(seen.captures, starts_ns, strict=True)
     ]
-    datagrams = map(to_datagram, packets_of(scans))
-    pcap = write_pcap(tmp_path / "lidar.pcap", [(each.host_ns, build_frame(each)) for each in datagrams])
+    pcap = tmp_path / "lidar.pcap"
+    write_datagrams(pcap, map(to_datagram, packets_of(scans)))
     davis = write_davis(tmp_path / "cam.aedat4", [], frames, (640, 360))
     document = seen.rig.model_dump()
     document["cameras"]["cam"]["channels"]["events"] = {"kind": "events", "topic": "/cam/events"}

@@ -19,7 +19,6 @@ from lce_rig.core.data import Sample
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import Observation
 from lce_rig.devices.disk_writer import DiskWriter, Sink
-from lce_rig.devices.reading import LiveSource
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -177,15 +176,12 @@ class CaptureWriter:
         return done
 
 
-def record_streams(
-    folder: Path, rig: Rig, sources: Sequence[LiveSource], disk: DiskWriter
-) -> tuple[Callable[[Sample], None], Sink[Sample]]:
-    """Record raw streams in a new folder: packets of sources that have them, samples of all others.
+def record_streams(folder: Path, rig: Rig, disk: DiskWriter) -> tuple[Callable[[Sample], None], Sink[Sample]]:
+    """Record the samples of all sensors as a bag in a new folder.
 
     Args:
         folder: does not exist yet.
         rig: the profile.
-        sources: not open yet.
         disk: writes.
 
     Returns:
@@ -195,12 +191,10 @@ def record_streams(
         SourceError: the folder exists already, or cannot be made.
     """
     recorder = BagRecorder.in_folder(folder, rig)
-    by_packets = {source.sensor for source in sources if source.record_packets(folder, disk)}
     sink: Sink[Sample] = disk.add(folder, recorder.write, recorder.close)
 
     def record(sample: Sample) -> None:
-        if sample.sensor not in by_packets:
-            arrays = [value for value in vars(sample).values() if isinstance(value, np.ndarray)]
-            sink.put(sample, sum(array.nbytes for array in arrays))
+        arrays = [value for value in vars(sample).values() if isinstance(value, np.ndarray)]
+        sink.put(sample, sum(array.nbytes for array in arrays))
 
     return record, sink

@@ -82,7 +82,7 @@ def collect_live(
         sys.setswitchinterval(_TURN_S)
         record, recorded = None, None
         if record_to is not None:
-            record, recorded = record_streams(record_to, rig, sources, disk)
+            record, recorded = record_streams(record_to, rig, disk)
         search = BoardSearch(rig)
         with search, Learning(rig, guides) as learning:
             keeper = CaptureWriter(session, disk)
