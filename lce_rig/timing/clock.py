@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
-from lce_rig.core.phrasing import significant
 
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
@@ -112,11 +111,6 @@ class ClockModel:
             min(self.n_used, other.n_used),
             f"{self.origin}, then {other.origin}",
         )
-
-    def __str__(self) -> str:
-        sigma_us = 1e-3 * self.sigma_ns(self.last_ns)
-        sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{significant(sigma_us, 3)} us"
-        return f"{self.origin}: drift {1e6 * self.drift:+.1f} ppm, known to {sigma}"
 
 
 def resolve_hour(past_hour_ns: int, near_ns: int) -> int:

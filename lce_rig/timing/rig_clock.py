@@ -12,15 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.core.data import Events, Image, LiveSample, Pulse, Sample, Scan
+from lce_rig.core.data import Events, Image, LiveSample, Pulse, Sample
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
 from lce_rig.rig.profile import BOARD, PPS_LINE
 from lce_rig.timing import findings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import MIN_PAIRS, Stamps, fit_clock, match_edges
-from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import Frame, middle_of_sweep_ns, tolerance_ns
 from lce_rig.timing.triggers import TriggerMatcher
 
 _N_EDGES = 2048
@@ -192,38 +190,6 @@ class RigClock:
         if isinstance(sample, Events):
             return replace(sample, t_ns=model.convert_all(sample.t_ns))
         return sample if sample.stamp_ns is None else replace(sample, stamp_ns=model.convert(sample.stamp_ns))
-
-    def pair_times(self, frame: Frame) -> list[dict[str, object]]:
-        """Measure how far the images and further scans of a placed frame lie from its first scan.
-
-        Returns:
-            An entry of the capture's manifest for each: `stream` ("cam.frames", or a second LiDAR), `lidar`,
-            `difference_s` of its time minus the middle of the scan, `sigma_s` of that by the clock models,
-            None where a clock is not tied, `tolerance_s` of the profile, and the models in words, `clock`.
-        """
-        anchor, pairs = frame.scans[0], list[dict[str, object]]()
-        parts: list[Image | Scan] = [*frame.images, *frame.scans[1:]]
-        for part in parts:
-            if isinstance(part, Image):
-                stream, time_ns = f"{part.sensor}.{part.channel}", rig_time_ns(part, self._rig)
-            else:
-                stream, time_ns = part.sensor, middle_of_sweep_ns(part, self._rig)
-            if time_ns is None:
-                continue
-            models = {sensor: self.models.get(sensor) for sensor in (part.sensor, anchor.sensor)}
-            sigmas = [each.inverse().sigma_ns(frame.time_ns) for each in models.values() if each is not None]
-            sigma_ns = sum(sigma**2 for sigma in sigmas) ** 0.5
-            words = [f"{sensor}: {model or 'its own timestamps'}" for sensor, model in models.items()]
-            pair = {
-                "stream": stream,
-                "lidar": anchor.sensor,
-                "difference_s": round((time_ns - frame.time_ns) * 1e-9, 9),
-                "sigma_s": round(sigma_ns * 1e-9, 9) if len(sigmas) == len(models) else None,
-                "tolerance_s": round(tolerance_ns(part, anchor, self._rig)) * 1e-9,
-                "clock": "; ".join(words),
-            }
-            pairs.append(pair)
-        return pairs
 
     def refresh(
         self, host_clock: ClockModel | None, utc_clock: ClockModel | None, locked: Collection[str]

@@ -243,11 +243,9 @@ class _Loop:
     def _capture(self, moment: CaptureMoment) -> None:
         detection, gate = moment.detection, self._find_gate()
         frame = detection.frame
-        pairs = self._clock.pair_times(frame)
         verdict = self._clock.verdict()
         meta: dict[str, object] = {
             "source": {"key": f"live:{frame.time_ns}", "label": f"live, at {frame.time_ns} ns"},
-            "pairs": pairs,
             "still_boards_only": verdict.requires_still_boards,
         }
         statuses = self._sensors.statuses()

@@ -63,8 +63,14 @@ def check_stamps(capture, placement, n_placements):
     # Scans begin with a loop, or a revolution or two later; the counter shows whole microseconds.
     late_ns = stamp_ns % (LOOP_NS // 3)
     assert min(late_ns, LOOP_NS // 3 - late_ns) < 2_000
-    (pair,) = capture.meta["pairs"]
-    assert abs(pair["difference_s"]) < 0.05
+    assert abs(apart_s(capture)) < 0.05
+
+
+def apart_s(capture, camera="cam"):
+    """Measure how far a capture's image lies from the middle of its scan."""
+    scan = capture.scan("lidar")
+    half_ns = 50_000_000 if scan.offset_ns is None else int(scan.offset_ns.max()) // 2
+    return (capture.image(camera, "frames").stamp_ns - scan.stamp_ns - half_ns) * 1e-9
 
 
 def captured_names(said):
