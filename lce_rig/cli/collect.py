@@ -57,19 +57,6 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     multiple=True,
 )
 @click.option(
-    "--pair",
-    type=click.Choice(["auto", "stem", "order", "time"]),
-    default="auto",
-    show_default=True,
-    help="Match a folder's images and point clouds by equal names, sorted order or nearest time.",
-)
-@click.option(
-    "--pair-tolerance",
-    type=FiniteRange(0),
-    metavar="S",
-    help="Set the maximum time difference of an image and its point cloud.",
-)
-@click.option(
     "--topic",
     "topics",
     multiple=True,
@@ -135,8 +122,6 @@ def collect(
     session: Path | None,
     output: Path | None,
     paths: tuple[Path, ...],
-    pair: Any,
-    pair_tolerance: float | None,
     topics: dict[str, str],
     cameras: tuple[str, ...],
     channels: tuple[str, ...],
@@ -187,7 +172,7 @@ def collect(
         _one_for_each(paths, "--lidar", lidars, rig.lidars),
         strict=True,
     )
-    sources = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
+    sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
     with show.progress_bar("collecting") as progress:
         report = fill_session(rig, recordings, session, CollectOptions(target=n_wanted), progress)
@@ -218,7 +203,7 @@ def _keep_text(session: Path, rig_name: str | None) -> None:
 
 
 _MOST_CAUSES = 5
-_OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars")
+_OF_RECORDINGS = ("topics", "cameras", "channels", "lidars")
 
 
 def _one_for_each(

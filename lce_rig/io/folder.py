@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
 from lce_rig.io.findings import NOT_DECODED, worded
 from lce_rig.io.protocol import (
-    PairMethod,
     SourceOptions,
     choose_camera,
     choose_lidar,
@@ -42,20 +41,11 @@ CLOUD_FOLDERS = (
     "ply",
 )
 MOSTLY = 0.9
+IN_ORDER = "paired in sorted order"
 
 
-class Pairing(NamedTuple):
-    """A choice of pairs, as positions in the two lists of names.
-
-    Attributes:
-        method: how the pairs were chosen.
-        pairs: (image, point cloud) positions, in the order of the images.
-        reason: the choice in words.
-    """
-
-    method: Literal["stem", "order", "time"]
-    pairs: list[tuple[int, int]]
-    reason: str
+Pairs: TypeAlias = list[tuple[int, int]]
+"""(image, point cloud) positions in two lists of names, in the order of the images."""
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
@@ -87,59 +77,57 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
 def pair_names(
     images: Sequence[str],
     clouds: Sequence[str],
-    method: PairMethod = "auto",
     tolerance_s: float = 0.05,
     *,
+    may_count: bool = True,
     what: str = "images",
     other: str = "point clouds",
-) -> Pairing:
+) -> tuple[Pairs, str]:
     """Match images and point clouds by their names (without suffix).
 
-    `auto` takes equal names where nine in ten match; else the nearest time, where names are times and nine in
+    Equal names are taken where nine in ten match; else the nearest time, where names are times and nine in
     ten find a partner within the tolerance; else sorted order, where there are as many images as point
-    clouds.
+    clouds; else the better of the first two.
 
     Args:
         images, clouds: names in natural order.
-        method: "stem", "order", "time", or "auto".
-        tolerance_s: largest difference in time, for "time".
+        tolerance_s: largest difference in time.
+        may_count: whether sorted order will do.
         what, other: name them in messages.
 
+    Returns:
+        The pairs, and how they were found, in words.
+
     Raises:
-        SourceError: the names do not allow the method, or no method.
+        SourceError: no name matches.
     """
     n, image_ns, cloud_ns = len(images), parse_times(images), parse_times(clouds)
-    candidates: list[Pairing] = []
-    if method in ("auto", "stem"):
-        # An image of the same name in another format makes a pair of its own.
-        place = {name: j for j, name in reversed(list(enumerate(clouds)))}
-        pairs = [(i, place[name]) for i, name in enumerate(images) if name in place]
-        candidates.append(Pairing("stem", pairs, "paired by equal file names"))
-    if method in ("auto", "time") and image_ns is not None and cloud_ns is not None:
-        reason = f"paired by nearest time within {tolerance_s:g} s"
-        candidates.append(Pairing("time", _nearest_pairs(image_ns, cloud_ns, tolerance_s), reason))
-    for pairing in candidates:
-        if len(pairing.pairs) >= MOSTLY * min(n, len(clouds)):
-            return pairing
-    if method in ("auto", "order") and n == len(clouds):
-        reason = "paired in sorted order"
+    # An image of the same name in another format makes a pair of its own.
+    place = {name: j for j, name in reversed(list(enumerate(clouds)))}
+    by_name = [(i, place[name]) for i, name in enumerate(images) if name in place]
+    candidates: list[tuple[Pairs, str]] = [(by_name, "paired by equal file names")]
+    if image_ns is not None and cloud_ns is not None:
+        near = _nearest_pairs(image_ns, cloud_ns, tolerance_s)
+        candidates.append((near, f"paired by nearest time within {tolerance_s:g} s"))
+    for pairs, reason in candidates:
+        if len(pairs) >= MOSTLY * min(n, len(clouds)):
+            return pairs, reason
+    if may_count and n == len(clouds):
+        reason = IN_ORDER
         if image_ns is not None and cloud_ns is not None:
             apart_s = np.abs(image_ns - cloud_ns).max() * 1e-9
             reason += f" (names are times up to {apart_s:.3f} s apart)"
-        return Pairing("order", [(i, i) for i in range(n)], reason)
-    best = max(candidates, key=lambda pairing: len(pairing.pairs), default=None)
-    if best is None or not best.pairs:
-        by = "" if method == "auto" else f" by {method}"
+        return [(i, i) for i in range(n)], reason
+    pairs, reason = max(candidates, key=lambda candidate: len(candidate[0]))
+    if not pairs:
         raise SourceError(
-            f"{n} {what} and {len(clouds)} {other} cannot be paired{by}: names and numbers differ",
-            "Give both files of a pair the same name, or remove files without a partner (--pair order).",
+            f"{n} {what} and {len(clouds)} {other} cannot be paired: names and numbers differ",
+            "Give both files of a pair the same name, or remove files without a partner.",
         )
-    return best
+    return pairs, reason
 
 
-def _nearest_pairs(
-    image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float
-) -> list[tuple[int, int]]:
+def _nearest_pairs(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float) -> Pairs:
     """Pair what is nearest in time to each other, both ways."""
     by_image, by_cloud = np.argsort(image_ns, kind="stable"), np.argsort(cloud_ns, kind="stable")
     cloud_of = by_cloud[nearest(image_ns, cloud_ns[by_cloud])]
@@ -228,19 +216,45 @@ class ImageOnDisk:
 
 
 @dataclass(frozen=True)
-class PairOnDisk:
-    """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
+class CloudOnDisk:
+    """A point cloud that has not been read yet; the timestamp comes from its name.
 
-    images: tuple[ImageOnDisk, ...]
-    cloud_path: Path
+    Attributes:
+        label: its name, for messages; with its folder's where several LiDARs may have the same names.
+    """
+
+    path: Path
+    label: str
     lidar: str
     settings: LidarSettings
-    cloud_stamp_ns: int | None
+    stamp_ns: int | None
+
+    def read(self, notes: set[str]) -> Scan:
+        """Decode it; `notes` receives what was assumed or skipped, in words.
+
+        Raises:
+            SourceError: it is missing, empty, truncated or damaged.
+        """
+        cloud = read_cloud(self.path)
+        return to_scan(cloud, self.lidar, self.settings, str(self.path), self.stamp_ns, notes=notes)
+
+
+@dataclass(frozen=True)
+class PlacementOnDisk:
+    """Images and point clouds of one placement of the board that have not been read yet."""
+
+    images: tuple[ImageOnDisk, ...]
+    clouds: tuple[CloudOnDisk, ...]
+
+    @property
+    def files(self) -> list[ImageOnDisk | CloudOnDisk]:
+        """All of them."""
+        return [*self.images, *self.clouds]
 
     @property
     def label(self) -> str:
         """The files' names, for messages."""
-        return " + ".join([*(image.label for image in self.images), self.cloud_path.name])
+        return " + ".join(file.label for file in self.files)
 
     def key(self) -> str:
         """Fingerprint the bytes of all files and the sensors they are read for.
@@ -249,10 +263,11 @@ class PairOnDisk:
             SourceError: a file cannot be read.
         """
         sensors = [f"{image.camera} {image.channel}" for image in self.images]
-        digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
-        for path in (*(image.path for image in self.images), self.cloud_path):
-            with reading(path):
-                digest.update(hashlib.sha256(path.read_bytes()).digest())
+        sensors += [cloud.lidar for cloud in self.clouds]
+        digest = hashlib.sha256(" ".join(sensors).encode())
+        for file in self.files:
+            with reading(file.path):
+                digest.update(hashlib.sha256(file.path.read_bytes()).digest())
         return digest.hexdigest()
 
     def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
@@ -261,33 +276,9 @@ class PairOnDisk:
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
         """
+        notes = set[str]()
         images = tuple(image.read() for image in self.images)
-        cloud, notes = read_cloud(self.cloud_path), set[str]()
-        where, stamp_ns = str(self.cloud_path), self.cloud_stamp_ns
-        scan = to_scan(cloud, self.lidar, self.settings, where, stamp_ns, notes=notes)
-        return images, (scan,), sorted(notes)
-
-
-@dataclass(frozen=True)
-class ScansOnDisk:
-    """The point clouds of one placement by several LiDARs, each as one of a pair without images."""
-
-    parts: tuple[PairOnDisk, ...]
-
-    @property
-    def label(self) -> str:
-        """The files' names, for messages."""
-        return " + ".join(f"{part.lidar}/{part.label}" for part in self.parts)
-
-    def key(self) -> str:
-        """Fingerprint as `PairOnDisk.key`."""
-        return hashlib.sha256(" ".join(part.key() for part in self.parts).encode()).hexdigest()
-
-    def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
-        """Decode as `PairOnDisk.read`."""
-        readings = [part.read() for part in self.parts]
-        scans = tuple(scan for _, of_part, _ in readings for scan in of_part)
-        return (), scans, [note for _, _, notes in readings for note in notes]
+        return images, tuple(cloud.read(notes) for cloud in self.clouds), sorted(notes)
 
 
 def _stamps_ns(files: Sequence[Path]) -> list[int | None]:
@@ -312,15 +303,24 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     images = []
     for name, paths in by_camera.items():
         camera, channel = choose_camera(rig, options, notes, name)
-        stamps_ns = _stamps_ns(paths)
         labels = [path.name if len(by_camera) == 1 else f"{path.parent.name}/{path.name}" for path in paths]
-        images.append(
-            [
-                ImageOnDisk(path, label, camera, channel, stamp_ns)
-                for path, label, stamp_ns in zip(paths, labels, stamps_ns, strict=True)
-            ]
-        )
+        files = zip(paths, labels, _stamps_ns(paths), strict=True)
+        images.append([ImageOnDisk(path, label, camera, channel, ns) for path, label, ns in files])
     return images
+
+
+def _clouds(paths: Sequence[Path], lidar: str, rig: Rig, folder: str = "") -> list[CloudOnDisk]:
+    """List the point clouds of a LiDAR; `folder` stands before their names in messages.
+
+    Raises:
+        SourceError: they are LAS files, whose reader is not installed.
+    """
+    if any(path.suffix.lower() == ".las" for path in paths):
+        require_las()
+    return [
+        CloudOnDisk(path, folder + path.name, lidar, rig.lidars[lidar], stamp_ns)
+        for path, stamp_ns in zip(paths, _stamps_ns(paths), strict=True)
+    ]
 
 
 class ImagesRecording:
@@ -403,44 +403,35 @@ class FolderRecording:
         """
         self.path = path
         self.notes: list[str] = []
-        self.pairs: Sequence[PairOnDisk | ScansOnDisk]
-        self._rig, self._options = rig, options
+        self._rig = rig
         if not rig.cameras:
             self.pairs = self._pair_scans()
             return
         lidar = choose_lidar(rig, options, self.notes)
         images = _images(path, rig, options, self.notes)
-        clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
-        if any(cloud.suffix.lower() == ".las" for cloud in clouds):
-            require_las()
-        cloud_ns = _stamps_ns(clouds)
+        suffixes = frozenset(DECODERS)
+        clouds = _clouds(_list(path, CLOUD_FOLDERS, suffixes, "point clouds", self.notes), lidar, rig)
         # The second image of one camera that goes with a point cloud makes a pair of its own.
         together: dict[tuple[int, int], list[ImageOnDisk]] = {}
         lone: list[str] = []
-        for of_camera, pairing in zip(images, self._pair(images, clouds), strict=True):
+        for of_camera, pairs in zip(images, self._pair(images, clouds), strict=True):
             n_held = Counter[int]()
-            for i, j in pairing.pairs:
+            for i, j in pairs:
                 together.setdefault((j, n_held[j]), []).append(of_camera[i])
                 n_held[j] += 1
-            with_cloud = {i for i, _ in pairing.pairs}
+            with_cloud = {i for i, _ in pairs}
             lone += [image.label for i, image in enumerate(of_camera) if i not in with_cloud]
         with_image = {j for j, _ in together}
-        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_image]
+        lone += [cloud.label for j, cloud in enumerate(clouds) if j not in with_image]
         if lone:
             more = f" and {len(lone) - 6} more" if len(lone) > 6 else ""
             self.notes.append(f"{path.name}: without a partner: {', '.join(lone[:6])}{more}")
         self.pairs = [
-            PairOnDisk(
-                tuple(held),
-                clouds[j],
-                lidar,
-                rig.lidars[lidar],
-                cloud_ns[j],
-            )
+            PlacementOnDisk(tuple(held), (clouds[j],))
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
 
-    def _pair_scans(self) -> list[ScansOnDisk]:
+    def _pair_scans(self) -> list[PlacementOnDisk]:
         """Match the point clouds of a rig without cameras, in folders named after its LiDARs.
 
         Raises:
@@ -449,16 +440,11 @@ class FolderRecording:
         folders = _folders(self.path)
         place = next((folders[n] for n in CLOUD_FOLDERS if n in folders and n not in self._rig.lidars), None)
         folders = folders if place is None else {**folders, **_folders(place)}
-        clouds: dict[str, list[PairOnDisk]] = {}
-        for name, settings in self._rig.lidars.items():
-            files = _files(folders[name.lower()], frozenset(DECODERS)) if name.lower() in folders else []
-            if files:
-                if any(file.suffix.lower() == ".las" for file in files):
-                    require_las()
-                clouds[name] = [
-                    PairOnDisk((), file, name, settings, stamp_ns)
-                    for file, stamp_ns in zip(files, _stamps_ns(files), strict=True)
-                ]
+        clouds = {
+            name: _clouds(files, name, self._rig, f"{name}/")
+            for name in self._rig.lidars
+            if name.lower() in folders and (files := _files(folders[name.lower()], frozenset(DECODERS)))
+        }
         if len(clouds) < 2:
             names = [f"{name}/" for name in self._rig.lidars]
             raise SourceError(
@@ -466,49 +452,41 @@ class FolderRecording:
                 f"Put each LiDAR's into a folder of its name: {', '.join(names)}; equal file names match.",
             )
         (first, firsts), *others = clouds.items()
-        together: dict[int, list[PairOnDisk]] = {}
+        together: dict[int, list[CloudOnDisk]] = {}
         for name, seconds in others:
-            tolerance_s = self._options.pair_tolerance_s
-            if tolerance_s is None:
-                limits = (self._rig.lidars[each].timestamps.tolerance_s for each in (first, name))
-                tolerance_s = max(limits)
-            of_second, of_first = ([part.cloud_path.stem for part in parts] for parts in (seconds, firsts))
-            both = {"what": f"point clouds of {name}", "other": f"of {first}"}
-            pairing = pair_names(of_second, of_first, self._options.pair, tolerance_s, **both)
-            self.notes.append(
-                f"{self.path.name}: {first} and {name}: {len(pairing.pairs)} pairs, {pairing.reason}"
-            )
-            for i, j in pairing.pairs:
+            tolerance_s = max(self._rig.lidars[each].timestamps.tolerance_s for each in (first, name))
+            of_second, of_first = ([cloud.path.stem for cloud in part] for part in (seconds, firsts))
+            what, other = f"point clouds of {name}", f"of {first}"
+            pairs, reason = pair_names(of_second, of_first, tolerance_s, what=what, other=other)
+            self.notes.append(f"{self.path.name}: {first} and {name}: {len(pairs)} pairs, {reason}")
+            for i, j in pairs:
                 together.setdefault(j, [firsts[j]]).append(seconds[i])
-        return [ScansOnDisk(tuple(parts)) for _, parts in sorted(together.items())]
+        return [PlacementOnDisk((), tuple(parts)) for _, parts in sorted(together.items())]
 
-    def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
-        """Match each camera's images with the point clouds, all cameras' in one way."""
-        pairings = [self._pair_camera(paths, clouds, self._options.pair) for paths in images]
-        methods = {pairing.method for pairing in pairings}
-        if len(methods) > 1:
+    def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[CloudOnDisk]) -> list[Pairs]:
+        """Match each camera's images with the point clouds."""
+        pairings = [self._pair_camera(files, clouds) for files in images]
+        if not all(reason.startswith(IN_ORDER) for _, reason in pairings):
             # A camera whose names match less well must not be counted off against the others' names.
-            method: PairMethod = "stem" if "stem" in methods else "time"
-            pairings = [self._pair_camera(paths, clouds, method) for paths in images]
-        for of_camera, pairing in zip(images, pairings, strict=True):
+            pairings = [self._pair_camera(files, clouds, may_count=False) for files in images]
+        for of_camera, (pairs, reason) in zip(images, pairings, strict=True):
             whose = f"{of_camera[0].camera}: " if len(images) > 1 else ""
-            note = f"{self.path.name}: {whose}{len(pairing.pairs)} pairs, {pairing.reason}"
-            n_images = len(of_camera) - len(pairing.pairs)
-            n_clouds = len(clouds) - len({j for _, j in pairing.pairs})
+            note = f"{self.path.name}: {whose}{len(pairs)} pairs, {reason}"
+            n_images = len(of_camera) - len(pairs)
+            n_clouds = len(clouds) - len({j for _, j in pairs})
             if n_images or n_clouds:
                 note += f"; {n_images} images and {n_clouds} point clouds have no partner"
             self.notes.append(note)
-        return pairings
+        return [pairs for pairs, _ in pairings]
 
     def _pair_camera(
-        self, images: Sequence[ImageOnDisk], clouds: Sequence[Path], method: PairMethod
-    ) -> Pairing:
-        first, tolerance_s = images[0], self._options.pair_tolerance_s
-        if tolerance_s is None:
-            tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
-        stems = [image.path.stem for image in images], [cloud.stem for cloud in clouds]
+        self, images: Sequence[ImageOnDisk], clouds: Sequence[CloudOnDisk], *, may_count: bool = True
+    ) -> tuple[Pairs, str]:
+        first = images[0]
+        tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
+        stems = [image.path.stem for image in images], [cloud.path.stem for cloud in clouds]
         try:
-            return pair_names(*stems, method, tolerance_s)
+            return pair_names(*stems, tolerance_s, may_count=may_count)
         except SourceError as error:
             whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
             raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None

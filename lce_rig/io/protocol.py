@@ -4,14 +4,13 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel
 
-PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
 _END_BYTES = 65536
 
 
@@ -22,8 +21,6 @@ class SourceOptions:
     Attributes:
         camera, channel, lidar: of a folder's images and point clouds; None takes the rig's first channel and
             LiDAR, and its camera where it has one only or folders are named after them.
-        pair: how a folder's images and point clouds are matched.
-        pair_tolerance_s: largest difference in time of a pair; None takes the profile's.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
         is_part: whether other recordings of the same moment hold what this one lacks.
     """
@@ -31,8 +28,6 @@ class SourceOptions:
     camera: str | None = None
     channel: str | None = None
     lidar: str | None = None
-    pair: PairMethod = "auto"
-    pair_tolerance_s: float | None = None
     topics: Mapping[str, str] = field(default_factory=dict)
     is_part: bool = False
 

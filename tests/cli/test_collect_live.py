@@ -21,7 +21,6 @@ from lce_rig.simulate import truth_extrinsics
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--pair", "order"], "--pair"),
         (["--topic", "cam=/x"], "--topic"),
         (["--from", "somewhere", "--hold", "3"], "--hold"),
         (["--from", "somewhere", "--simulated"], "--simulated"),
