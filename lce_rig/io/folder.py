@@ -28,18 +28,7 @@ from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.clock_fit import nearest
 
 IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
-CLOUD_FOLDERS = (
-    "pcd",
-    "raw_pcd",
-    "pcds",
-    "cloud",
-    "clouds",
-    "lidar",
-    "velodyne",
-    "points",
-    "pointcloud",
-    "ply",
-)
+CLOUD_FOLDERS = ("pcd", "raw_pcd", "cloud", "clouds", "lidar", "velodyne", "points", "pointcloud", "ply")
 MOSTLY = 0.9
 IN_ORDER = "paired in sorted order"
 
