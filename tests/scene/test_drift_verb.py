@@ -164,7 +164,7 @@ def test_long_recordings_are_thinned_evenly_while_they_are_read():
 def test_attached_sensors_are_watched(seen, tmp_path, capsys):
     capture = seen.captures[0]
     here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
-    with attach(here, tmp_path) as (rig, _):
+    with attach(here, tmp_path) as rig:
         (tmp_path / "rig.yaml").write_text(dump_rig(rig.model_copy(update={"sync": None})))
         result = result_file(tmp_path / "deployed.json", seen, seen.truth)
         words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
@@ -179,7 +179,7 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys):
 def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path):
     capture = seen.captures[0]
     here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
-    with attach(here, tmp_path) as (rig, _):
+    with attach(here, tmp_path) as rig:
         (tmp_path / "rig.yaml").write_text(dump_rig(rig.model_copy(update={"sync": None})))
         result = result_file(tmp_path / "deployed.json", seen, seen.truth)
         words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]

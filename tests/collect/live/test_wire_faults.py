@@ -133,7 +133,7 @@ def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_
     rig, session, streams = wire(), tmp_path / "session", tmp_path / "streams"
     with Collecting(rig.profile, session, "--hold", "0", "--record", str(streams)) as collecting:
         collecting.wait_for_captures(1)
-        # Captures fit below this limit, the packets of the LiDAR soon do not.
+        # Captures fit below this limit, the recording soon does not.
         resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
         collecting.wait_for_captures(3)
         assert collecting.end() == 5
