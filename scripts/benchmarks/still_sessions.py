@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import kept_folder
+from lce_rig.calibrate.likelihood.images import stack_images
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
-from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.geometry import Array, invert, perturb, transform
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import from_arrays, to_arrays
@@ -46,7 +48,13 @@ class StillSession:
 
 
 def still_session(
-    rig: Rig, seed: int, options: SimulationOptions, n_captures: int, sigma_px: float, folder: Path
+    rig: Rig,
+    seed: int,
+    options: SimulationOptions,
+    n_captures: int,
+    sigma_px: float,
+    folder: Path,
+    levels: Levels | None = None,
 ) -> StillSession:
     """Read a session's scans from a folder, or simulate them and keep them there; then draw its corners.
 
@@ -57,6 +65,7 @@ def still_session(
         n_captures: placements of the board.
         sigma_px: noise of each corner's coordinates.
         folder: where detections are kept, see `kept_folder`.
+        levels: of the errors that corners of one image share; None for none.
     """
     path = kept_folder(folder, rig, options) / f"{n_captures}-{seed:04d}.npz"
     if not path.exists():
@@ -75,6 +84,10 @@ def still_session(
             {key[len(prefix) :]: value for key, value in kept.items() if key.startswith(prefix)}
         )
         image = draw_corners(rig, T_cam_board, sigma_px, rng)
+        if image is not None and levels is not None:
+            images = stack_images(np.zeros(1, dtype=np.intp), [image])
+            shared = rng.multivariate_normal(np.zeros(6), (images.total_cov(levels) - images.cov)[0])
+            image = draw_corners(rig, perturb(T_cam_board, shared), sigma_px, rng)
         if isinstance(scan, list) and image is not None:
             boards = [board for board in scan if isinstance(board, LidarBoard)]
             candidates.append(Observation.of(name, image, boards))

@@ -33,7 +33,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import model_of
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.rig import Rig, load_rig, parse_rig
+from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
 
 CORNER_SIGMA_PX = 0.1
@@ -51,13 +51,17 @@ _WITHIN = 1.5
 
 @dataclass(frozen=True)
 class Case:
-    """What is simulated: a rig, perhaps with another LiDAR, and how that errs beyond the defaults."""
+    """What is simulated: a rig, perhaps with another LiDAR, and how it errs beyond the defaults.
+
+    Levels are those of errors that the corners of one image share.
+    """
 
     rig: str
     label: str
     model: str = ""
     range_offset_m: float = 0.0
     edge_growth_m: float | None = None
+    levels: Levels | None = None
 
     def profile(self) -> Rig:
         """Load the profile with the LiDAR's model."""
@@ -81,18 +85,14 @@ CASES = (
     Case("rlfs", "rlfs, ranges +2 cm, edges +3 mm", range_offset_m=0.02, edge_growth_m=0.003),
 )
 PROFILES_IN_ERROR = CASES[:2]
-WITHOUT_RINGS = (Case("mid360", "Mid-360"), Case("mid360", "Avia", model="Avia"))
+WITHOUT_RINGS = (
+    Case("mid360", "Mid-360"),
+    Case("mid360", "Avia", model="Avia"),
+    Case("mid360", "Mid-360, images as recorded", levels=Levels()),
+    Case("mid360", "Avia, images as recorded", model="Avia", levels=Levels()),
+)
 _TWO = "VLP-16 and OS1-64"
-_TWO_LIDARS = """
-format_version: 1
-name: lidars
-board: {type: plain, width_m: 0.9, height_m: 0.7}
-lidars:
-  front: {model: VLP-16, frame: front_link, topic: /front, rate_hz: 10}
-  side: {model: OS1-64, frame: side_link, topic: /side, rate_hz: 10}
-nominal_extrinsics:
-  - {camera: front, lidar: side, rpy_deg: [0, 0, 30], translation_m: [0.05, 0.4, -0.1]}
-"""
+_TWO_PROFILE = Path(__file__).parents[2] / "tests/rigs/two_lidars.yaml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,14 +204,16 @@ def _runs_without_rings(case: Case, n_seeds: int, folder: Path, n_captures: int)
     (lidar,) = rig.lidars.values()
     settings = EstimateSettings.of(CalibrateOptions("ml"), lidar)
     for seed in range(n_seeds):
-        session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
+        session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder, case.levels)
         estimate = fit_extrinsic(session.candidates, rig.board.to_board(), settings)
         yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov)
 
 
 def _runs_of_lidars(n_seeds: int, n_captures: int) -> Iterator[Run]:
     """Calibrate two LiDARs to each other, without a camera."""
-    rig = parse_rig(_TWO_LIDARS)
+    rig = load_rig(_TWO_PROFILE)
+    side = rig.lidars["side"].model_copy(update={"model": "OS1-64"})
+    rig = rig.model_copy(update={"lidars": {**rig.lidars, "side": side}})
     finder, pair = BoardFinder(rig), ("front", "side")
     for seed in range(n_seeds):
         scans: dict[str, dict[str, LidarDetection]] = {name: {} for name in pair}

@@ -6,6 +6,7 @@ Most captures are of a simulated Mid-360, whose scans are accumulated for a seco
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,16 +24,7 @@ from tests.shared import half_size, make_once
 
 # Of six freedoms, beyond which chance brings one of a thousand.
 CHI2 = 22.5
-LIDARS = """
-format_version: 1
-name: lidars
-board: {type: plain, width_m: 0.9, height_m: 0.7}
-lidars:
-  front: {model: VLP-16, frame: front_link, topic: /front, rate_hz: 10}
-  side: {model: VLP-16, frame: side_link, topic: /side, rate_hz: 10}
-nominal_extrinsics:
-  - {camera: front, lidar: side, rpy_deg: [0, 0, 30], translation_m: [0.05, 0.4, -0.1]}
-"""
+TWO_LIDARS = Path(__file__).parents[1] / "rigs" / "two_lidars.yaml"
 
 
 @pytest.fixture(scope="session")
@@ -200,7 +192,7 @@ def test_clouds_without_tags_are_used_whole(lce_rig, standing, tmp_path, has_dus
     [("VLP-16", True, "verdict.lidars_exchanged"), ("OS1-64", False, "verdict.other_model")],
 )
 def test_lidars_under_each_others_name_fail(lce_rig, tmp_path, model, has_nominal, finding):
-    profile = yaml.safe_load(LIDARS)
+    profile = yaml.safe_load(TWO_LIDARS.read_text())
     profile["lidars"]["side"]["model"] = model
     (tmp_path / "lidars.yaml").write_text(yaml.safe_dump(profile))
     words = (tmp_path / "s", "--rig", tmp_path / "lidars.yaml", "--captures", 8, "--seed", 1)
