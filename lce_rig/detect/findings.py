@@ -131,6 +131,11 @@ IMAGE_OTHER_LAYOUT = Kind(
     "{n_fitting} of {n_markers} markers lie where the profile's board has them",
     "correct board.squares, or board.tags and board.tag_spacing",
 )
+IMAGE_OTHER_SPACING = Kind(
+    "image.other_spacing",
+    "{part} measure {share:g} of the side of {unit}, {stated:g} in the profile",
+    "measure the print and correct board.{key}",
+)
 IMAGE_FEW_CORNERS = Kind(
     "image.few_corners",
     "{n_corners} corners are clear enough to measure (minimum {n_needed})",

@@ -5,10 +5,12 @@ measured as a checkerboard's, by the edges about it. Corners that do not look as
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -21,6 +23,7 @@ from lce_rig.detect.findings import (
     IMAGE_OTHER_DICTIONARY,
     IMAGE_OTHER_IDS,
     IMAGE_OTHER_LAYOUT,
+    IMAGE_OTHER_SPACING,
 )
 from lce_rig.detect.image.corners import Grey
 from lce_rig.detect.image.saddle import REACH, Crossings, Patches, fit_crossings
@@ -47,6 +50,12 @@ _MOST_NEW = 0.25
 _FREE = 0.8
 # Black is darker than its surroundings by so many grey values; by so many deviations of an AprilGrid's noise.
 _DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
+# Gaps between tags may differ from the profile's by so much of a tag's side: more moves poses by centimetres.
+# What differs by fewer deviations of the measurement is not known to differ.
+_MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
+_GAP_SHARES = (0.05, 1.2)
+# As far may they seem to differ by the corners of markers, which lie up to a pixel inside.
+_MAX_SHARE_OFF = 0.1
 
 
 def find_marked_grid(
@@ -70,16 +79,20 @@ def find_marked_grid(
     figures: dict[str, Figure] = {"n_markers": len(places), "dictionary": board.dictionary}
     if len(foreign) >= max(3, _MIN_FOREIGN * len(places)):
         figures |= {"first_id": wanted[0], "last_id": wanted[-1]}
-        return IMAGE_OTHER_IDS.refusal(**figures, first_seen=foreign[0], last_seen=foreign[-1])
+        other = _other_dictionary(grey, board, len(places)) if is_thorough else None
+        return other or IMAGE_OTHER_IDS.refusal(**figures, first_seen=foreign[0], last_seen=foreign[-1])
     if len(ours) < _MIN_MARKERS:
-        return _other_dictionary(grey, board) if is_thorough else None
+        return _other_dictionary(grey, board, len(places)) if is_thorough else None
     T_cam_board, n_fitting, is_legacy = _agree(ours, board, intrinsics)
     if T_cam_board is None or n_fitting < max(_MIN_MARKERS, _MIN_FITTING * len(ours)):
-        return IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
+        other = _with_other_spacing(ours, board, intrinsics)
+        return other or IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
     crossings, n_seen = _measure(grey, board, intrinsics, T_cam_board, is_legacy)
     if crossings is None:
-        return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
-    return crossings
+        other = _with_other_spacing(ours, board, intrinsics)
+        return other or IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
+    gap_share = _measure_gap(crossings, board, intrinsics) if board.type == "aprilgrid" else None
+    return crossings if gap_share is None else _other_spacing(board, gap_share)
 
 
 def keep_marked(
@@ -169,10 +182,10 @@ def _noise(grey: Grey) -> float:
     return float(np.median(np.abs(rough))) / (0.6745 * 6)
 
 
-def _other_dictionary(grey: Grey, board: Board) -> Refusal | None:
-    """Name the dictionary of which the image has markers; None if there is none."""
+def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
+    """Name the dictionary of which the image has more markers than the board's n_own; None if none has."""
     own = _family(board.dictionary)
-    best, most = "", 3
+    best, most = "", max(n_own, 3)
     # The largest of a family holds the markers of the smaller ones.
     for name in DICTIONARIES:
         if not name.endswith(("_50", "_100", "_250")) and _family(name) != own:
@@ -201,9 +214,7 @@ def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array 
     """
     ids = sorted(places)
     pixels = np.array([places[number] for number in ids])
-    rays = intrinsics.unproject(pixels.reshape(-1, 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        flat = np.where(rays[:, 2:] > 0.05, rays[:, :2] / rays[:, 2:], np.nan).reshape(-1, 4, 2)
+    flat = _flatten(pixels, intrinsics)
     is_ahead = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
     best: tuple[int, NDArray[np.bool_], Array, bool] | None = None
     for markers, turn, is_legacy in _readings(board):
@@ -218,6 +229,75 @@ def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array 
     corners_px, corners_board = pixels[is_fitting].reshape(-1, 2), on_board[is_fitting].reshape(-1, 3)
     solved = solve_planar_pose(corners_px, corners_board, intrinsics)
     return None if solved is None else solved.T_cam_board, n_fitting, is_legacy
+
+
+def _flatten(pixels: Array, intrinsics: Intrinsics) -> Array:
+    """Return where rays of pixels (..., 2) meet the plane at z = 1; NaN for those far to the side."""
+    rays = intrinsics.unproject(pixels.reshape(-1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = np.where(rays[:, 2:] > 0.05, rays[:, :2] / rays[:, 2:], np.nan)
+    return np.asarray(flat.reshape(pixels.shape))
+
+
+def _with_other_spacing(places: Places, board: Board, intrinsics: Intrinsics) -> Refusal | None:
+    """Measure gaps or markers where the profile's do not explain the image; None if no others do.
+
+    A homography takes the lattice of their centres to the image, and their corners back to units of its side.
+    """
+    ids = sorted(places)
+    flat = _flatten(np.array([places[number] for number in ids]), intrinsics)
+    if len(ids) < 4 or not np.isfinite(flat).all():
+        return None
+    pitch_m = board.square_m * (1 + (board.gap_share if board.type == "aprilgrid" else 0.0))
+    for markers, _, _ in _readings(board):
+        centres = markers.corners[np.array(ids) - board.first_id, :, :2].mean(axis=1) / pitch_m
+        H, is_fitting = cv2.findHomography(flat.mean(axis=1), centres, cv2.RANSAC, _MAX_AWAY)
+        if H is None:
+            continue
+        lattice = cv2.perspectiveTransform(flat[is_fitting.ravel() > 0].reshape(1, -1, 2), H)
+        side = float(np.median(np.linalg.norm(np.diff(lattice.reshape(-1, 4, 2), axis=1), axis=-1)))
+        share, stated = side, board.marker_share
+        other = replace(board, marker_share=share)
+        if board.type == "aprilgrid":
+            share, stated = 1 / side - 1, board.gap_share
+            other = replace(board, gap_share=share)
+        n_fitting = _agree(places, other, intrinsics)[1]
+        if abs(share - stated) > _MAX_SHARE_OFF and n_fitting >= max(4, _MIN_FITTING * len(ids)):
+            return _other_spacing(board, share)
+    return None
+
+
+def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> float | None:
+    """Measure the gaps between tags, of their side, by the homography; None if they are the profile's.
+
+    A wrong gap shrinks or stretches single rows and columns: neither a pose nor a lens does.
+    """
+    is_seen = np.isfinite(crossings.grid_px).all(axis=-1).ravel()
+    flat = _flatten(crossings.grid_px.reshape(-1, 2)[is_seen], intrinsics)
+    if not np.isfinite(flat).all():
+        return None
+
+    def misfit(share: float) -> float:
+        on_board = replace(board, gap_share=share).corners()[is_seen, :2]
+        H, _ = cv2.findHomography(on_board, flat)
+        if H is None:
+            return np.inf
+        return float(np.sum((cv2.perspectiveTransform(on_board[None], H)[0] - flat) ** 2))
+
+    found = minimize_scalar(misfit, bounds=_GAP_SHARES, method="bounded")
+    # Eight of a homography, and the gap.
+    variance = found.fun / (2 * len(flat) - 9)
+    is_other = misfit(board.gap_share) - found.fun > _GAP_SIGMAS**2 * variance
+    return float(found.x) if is_other and abs(found.x - board.gap_share) > _MAX_GAP_OFF else None
+
+
+def _other_spacing(board: Board, share: float) -> Refusal:
+    """Refuse a board whose gaps or markers are wider or narrower than the profile's."""
+    if board.type == "aprilgrid":
+        figures = {"part": "gaps between tags", "unit": "a tag", "key": "tag_spacing"}
+        return IMAGE_OTHER_SPACING.refusal(**figures, share=round(share, 3), stated=board.gap_share)
+    figures = {"part": "markers", "unit": "a square", "key": "marker_m"}
+    return IMAGE_OTHER_SPACING.refusal(**figures, share=round(share, 2), stated=board.marker_share)
 
 
 def _readings(board: Board) -> Iterator[tuple[Markers, int, bool]]:
