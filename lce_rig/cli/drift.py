@@ -127,7 +127,6 @@ _OF_AXES = (
     "scene.large_scatter",
     "scene.flat",
     "scene.no_peak",
-    "scene.best_uncertain",
     "scene.board_changed",
     "scene.board_unsure",
 )

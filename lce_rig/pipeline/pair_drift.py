@@ -148,8 +148,6 @@ class PairDrift:
             "axes": [axis.document() for axis in self.drift.axes],
             "contradictions": [each.subject for each in self.contradictions],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
-            "T_cam_lidar_best": self.drift.T_best.tolist(),
-            "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
             "board": None if self.board is None else self.board.document(),
             "findings": [finding.as_json() for finding in self.findings],
         }
@@ -170,7 +168,7 @@ class DriftReport:
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Draw for each pair the edges of one capture under the deployed and the best extrinsics.
+        """Draw for each pair the edges of one capture under the deployed extrinsics and those that changed.
 
         Raises:
             SessionError: a file cannot be written.
@@ -180,7 +178,9 @@ class DriftReport:
             if pair.example is None:
                 continue
             name, image, view = pair.example
-            c, poses = pair.calibration, {"deployed": pair.drift.T_cam_lidar, "best fit": pair.drift.T_best}
+            c, poses = pair.calibration, {"deployed": pair.drift.T_cam_lidar}
+            if pair.drift.state == "changed":
+                poses["changed"] = pair.drift.T_changed
             title = f"{c.camera}, {c.lidar}  {name}"
             picture = draw_edges(image, view.edges, self.rig.lens_of(c), poses, title)
             files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))

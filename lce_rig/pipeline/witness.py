@@ -36,7 +36,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
     """
     c = calibration
     views = scene_views(session, detections, c, OPINION_CAPTURES)
-    drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov, is_joint=False)
+    drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov)
     return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.curves else ())
 
 
@@ -94,12 +94,12 @@ def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Calibratio
 
     T_boards, cov_boards = by_boards.T_cam_lidar, by_boards.cov
     own = cov_boards - by_boards.cov_shared
-    found = estimate(views, lens, T_boards, (T_boards, own))
-    change = difference(found.T_cam_lidar, T_boards)
+    T_both, cov_both = estimate(views, lens, T_boards, own)
+    change = difference(T_both, T_boards)
     root = np.asarray(np.linalg.cholesky(own), dtype=np.float64)
-    gain = np.eye(6) - np.linalg.solve(own, found.cov).T
-    expected = own - found.cov + gain @ by_boards.cov_shared @ gain.T
-    removed, directions = np.linalg.eigh(_whitened(own - found.cov, root))
+    gain = np.eye(6) - np.linalg.solve(own, cov_both).T
+    expected = own - cov_both + gain @ by_boards.cov_shared @ gain.T
+    removed, directions = np.linalg.eigh(_whitened(own - cov_both, root))
     is_known = removed > _KNOWN_SHARE
     seen = directions[:, is_known].T
     along = seen @ np.linalg.solve(root, change)
@@ -110,8 +110,8 @@ def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Calibratio
         state="contradicts" if is_surprising else "used" if n_known else "unknown",
         n_captures=len(views),
         n_edges=sum(len(view.edges) for view in views),
-        T_cam_lidar=found.T_cam_lidar,
-        cov=found.cov + by_boards.cov_shared,
+        T_cam_lidar=T_both,
+        cov=cov_both + by_boards.cov_shared,
         T_cam_lidar_boards=T_boards,
         cov_boards=cov_boards,
         change=change,

@@ -14,8 +14,8 @@ from lce_rig.scene.edge_field import EdgeField
 IS_ROTATION = np.array([False, False, False, True, True, True])
 
 _COLUMNS, _ROWS = 8, 3  # parts of the image
-BESIDE_RAD = 0.05
-"""Edges so far outside the image count by default: other extrinsics bring them in."""
+_BESIDE_RAD = 0.05
+"""Edges so far outside the image count: other extrinsics bring them in."""
 _SCALE_RAD = 0.003  # of derivatives: about the field's blur
 _REACH = np.where(IS_ROTATION, np.radians(3.0), 0.3)
 _STEPS = np.linspace(-1.0, 1.0, 61)
@@ -39,20 +39,13 @@ class Alignment:
         views: at least one.
         intrinsics: of the camera.
         T_cam_lidar: (4, 4) that perturbations start from.
-        beside_rad: edges so far outside the image count: other extrinsics bring them in.
     """
 
-    def __init__(
-        self,
-        views: Sequence[SceneView],
-        intrinsics: Intrinsics,
-        T_cam_lidar: Array,
-        beside_rad: float = BESIDE_RAD,
-    ) -> None:
+    def __init__(self, views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array) -> None:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         points = np.concatenate([view.edges.points for view in views])
         pixels, _ = intrinsics.project(transform(T_cam_lidar, points))
-        margin_px = -beside_rad * intrinsics.fx_px
+        margin_px = -_BESIDE_RAD * intrinsics.fx_px
         near = intrinsics.is_inside(pixels, margin_px)
         of_view = np.repeat(np.arange(len(views)), [len(view.edges) for view in views])
         self._points, self.n_captures = points[near], len(views)

@@ -10,11 +10,10 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import KINDS, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.scene.alignment import IS_ROTATION, Alignment, Curve, SceneView
-from lce_rig.scene.estimate import BIAS, estimate
+from lce_rig.scene.estimate import BIAS
 from lce_rig.scene.findings import (
     AXIS_CHANGED,
     AXIS_UNCHANGED,
-    BEST_UNCERTAIN,
     CHANGED,
     FEW_EDGES,
     FLAT,
@@ -58,8 +57,6 @@ class Drift:
         axes: one verdict each, order of MOTIONS; all "unknown" where nothing could be compared.
         findings: the summary first, then one of each axis and what is missing.
         T_cam_lidar: (4, 4) deployed.
-        T_best: (4, 4) where all six axes together fit best; the deployed where nothing could be compared.
-        cov_best: (6, 6) of its tangent; None where it was not searched.
         curves: the score along each axis about the deployed extrinsics; empty where nothing was compared.
         n_captures, n_edges: compared.
     """
@@ -67,8 +64,6 @@ class Drift:
     axes: tuple[AxisDrift, ...]
     findings: tuple[Finding, ...]
     T_cam_lidar: Array
-    T_best: Array
-    cov_best: Array | None
     curves: Mapping[Motion, Curve]
     n_captures: int
     n_edges: int
@@ -85,14 +80,7 @@ class Drift:
         return perturb(self.T_cam_lidar, np.where(IS_ROTATION, np.radians(moved), moved))
 
 
-def watch(
-    views: Sequence[SceneView],
-    intrinsics: Intrinsics,
-    T_cam_lidar: Array,
-    cov: Array,
-    *,
-    is_joint: bool = True,
-) -> Drift:
+def watch(views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array, cov: Array) -> Drift:
     """Compare deployed extrinsics with the scene of some captures.
 
     Each axis is searched alone within 3 deg or 30 cm. The change with the highest score is applied and the
@@ -103,7 +91,6 @@ def watch(
         intrinsics: of the camera.
         T_cam_lidar: (4, 4) deployed.
         cov: (6, 6) of the deployed extrinsics' tangent.
-        is_joint: whether to search for the best extrinsics in all axes, too.
     """
     n_edges, missing = 0, []
     if views and any(len(view.edges) for view in views):
@@ -122,15 +109,11 @@ def watch(
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
         few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
         axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in MOTIONS)
-        return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, None, {}, len(views), n_edges)
+        return Drift(axes, (few, *missing), T_cam_lidar, {}, len(views), n_edges)
 
     sigma_deployed = np.sqrt(np.diag(cov))
     curves = [alignment.curve(axis, np.zeros(6)) for axis in range(6)]
-    axes, tangent = _decide(alignment, curves, sigma_deployed)
-    T_best, cov_best = perturb(T_cam_lidar, tangent), None
-    if is_joint:
-        best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
-        T_best, cov_best = best.T_cam_lidar, best.cov
+    axes = _decide(alignment, curves, sigma_deployed)
     changed, unknown = (
         tuple(axis.axis for axis in axes if axis.state == state) for state in ("changed", "unknown")
     )
@@ -141,17 +124,12 @@ def watch(
             findings.append(AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures))
         else:
             findings.append(KINDS[axis.reason or AXIS_UNCHANGED.code](axis.axis, **axis.figures))
-    if cov_best is not None and np.any(is_open := np.sqrt(np.diag(cov_best)) > LARGEST):
-        findings.append(BEST_UNCERTAIN(axes=tuple(np.array(MOTIONS)[is_open].tolist())))
     by_axis = dict(zip(MOTIONS, curves, strict=True))
-    every = (*findings, *missing)
-    return Drift(axes, every, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
+    return Drift(axes, (*findings, *missing), T_cam_lidar, by_axis, len(views), n_edges)
 
 
-def _decide(
-    alignment: Alignment, curves: list[Curve], sigma_deployed: Array
-) -> tuple[tuple[AxisDrift, ...], Array]:
-    """Take changes one by one, the most rewarding first; (the verdicts, the tangent of all changes)."""
+def _decide(alignment: Alignment, curves: list[Curve], sigma_deployed: Array) -> tuple[AxisDrift, ...]:
+    """Judge each axis: changes are taken one by one, the most rewarding first."""
     tangent, changed = np.zeros(6), {}
     while True:
         verdicts = {
@@ -168,7 +146,7 @@ def _decide(
         tangent[axis] += curves[axis].peak
         changed[axis] = replace(verdicts[axis], instead=instead)
         curves = [alignment.curve(each, tangent) for each in range(6)]
-    return tuple((verdicts | changed)[axis] for axis in range(6)), tangent
+    return tuple((verdicts | changed)[axis] for axis in range(6))
 
 
 def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment) -> AxisDrift:

@@ -1,7 +1,6 @@
-"""Extrinsics from a scene's edges in all six axes, with a covariance, and with a prior such as a board's."""
+"""Extrinsics from a scene's edges in all six axes and a prior such as a board's, with a covariance."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import numpy as np
@@ -9,13 +8,12 @@ from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
-from lce_rig.scene.alignment import BESIDE_RAD, IS_ROTATION, Alignment, SceneView
+from lce_rig.scene.alignment import IS_ROTATION, Alignment, SceneView
 
 BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.10, 0.05, 0.15])])
 """What one scene's maximum is off by beyond the scatter of its parts: sigmas in the order of MOTIONS."""
 
 _UNIT = np.where(IS_ROTATION, np.radians(1.0), 0.03)  # Either moves an edge 2 m away by about as much.
-_ANYWHERE = np.where(IS_ROTATION, np.radians(3.0), 0.15)  # of extrinsics of which nothing else is known
 _MAX_STEPS, _LEAST_GAIN = 20, 0.01
 _CELL_RAD, _CELL_LOG = 0.1, 0.15  # A part of the scene: an upright object, by azimuth and logarithm of range.
 _SHIFTS = (0.0, 0.25, 0.5, 0.75)  # of the grids of cells, in cells
@@ -25,36 +23,12 @@ _CHANCE = 2.0  # A direction needs a curvature of more than the root of so many 
 _N_WEAK, _OFFSETS = 2, (-1.4, -0.7, 0.7, 1.4)
 _LEAST_REACH = 0.3
 _SAME = 0.15  # Maxima so close are one.
-# A search from far off: starts tried at low resolution, those climbed from there, and those to the end.
-_FAR = np.where(IS_ROTATION, np.radians(3.0), 0.2)
-_BESIDE_RAD = 0.12
-_N_SWEPT, _N_KEPT, _N_FINE = 2048, 16, 6
-_SWEPT_CAPTURES, _SWEPT_EDGES = 5, 400
-
-
-@dataclass(frozen=True, eq=False)
-class SceneEstimate:
-    """Extrinsics by a scene, and by a prior if there is one.
-
-    Attributes:
-        T_cam_lidar: (4, 4).
-        cov: (6, 6) of the tangent (translation m, rotation rad), axes of the camera, order of MOTIONS. In
-            directions that the scene does not show it is the prior's.
-    """
-
-    T_cam_lidar: Array
-    cov: Array
 
 
 def estimate(
-    views: Sequence[SceneView],
-    intrinsics: Intrinsics,
-    T_start: Array,
-    prior: tuple[Array, Array] | None = None,
-    *,
-    is_far: bool = False,
-) -> SceneEstimate:
-    """Estimate extrinsics from the edges of a scene.
+    views: Sequence[SceneView], intrinsics: Intrinsics, T_prior: Array, cov_prior: Array
+) -> tuple[Array, Array]:
+    """Estimate extrinsics from the edges of a scene and a prior.
 
     With the gradient g of the score by the tangent, H minus its curvature at the scale of its peak, and J the
     sum of g g^T over parts of the scene, the scene's maximum has the covariance H^-1 J H^-1 + B, B its bias.
@@ -64,18 +38,18 @@ def estimate(
     Args:
         views: captures.
         intrinsics: of the camera.
-        T_start: (4, 4) where the search starts.
-        prior: (4, 4) extrinsics and the (6, 6) covariance of their tangent; None for a wide one about
-            `T_start`, of 3 deg and 0.15 m.
-        is_far: whether the start may be off by 3 deg and 0.2 m: many starts about it are tried.
+        T_prior: (4, 4) extrinsics, where the search starts.
+        cov_prior: (6, 6) of their tangent.
+
+    Returns:
+        T_cam_lidar (4, 4), and the covariance (6, 6) of its tangent (translation m, rotation rad), axes of
+        the camera. In directions that the scene does not show it is the prior's.
     """
-    T_prior, cov_prior = (T_start, np.diag(_ANYWHERE**2)) if prior is None else prior
     if not any(len(view.edges) for view in views):
-        return SceneEstimate(T_prior, cov_prior)
+        return T_prior, cov_prior
     held = np.linalg.inv(cov_prior / np.outer(_UNIT, _UNIT))
-    alignment = Alignment(views, intrinsics, T_start, _BESIDE_RAD if is_far else BESIDE_RAD)
-    starts = _sweep(views, intrinsics, T_start) if is_far else []
-    maxima = _search(alignment, [T_start, *starts], T_prior, held)
+    alignment = Alignment(views, intrinsics, T_prior)
+    maxima = _search(alignment, T_prior, held)
     # The parts of the scene that points (N, 3) belong to, (N,) each: cells of shifted grids.
     x, y, _ = alignment.points.T
     log_range = np.log(np.linalg.norm(alignment.points, axis=1))
@@ -86,35 +60,17 @@ def estimate(
     ]
     T, information = _balance(alignment, cells, maxima[0], T_prior, held)
     cov = np.linalg.inv(information + held) + _rivalry(alignment, cells, maxima)
-    return SceneEstimate(T, np.outer(_UNIT, _UNIT) * cov)
+    return T, np.outer(_UNIT, _UNIT) * cov
 
 
-def _sweep(views: Sequence[SceneView], intrinsics: Intrinsics, T_start: Array) -> list[Array]:
-    """Score many extrinsics about a start at low resolution, on a few captures; the best of them."""
-    chosen = views[:: -(-len(views) // _SWEPT_CAPTURES)]
-    thinned = [
-        replace(view, edges=view.edges.select(np.arange(len(view.edges)) % stride == 0))
-        for view in chosen
-        for stride in (1 + len(view.edges) // _SWEPT_EDGES,)
-    ]
-    alignment = Alignment(thinned, intrinsics, T_start, _BESIDE_RAD).coarser().coarser()
-    # A sequence of low discrepancy: multiples of powers of the root of x^7 = x + 1 (Roberts 2018).
-    powers = 1.1127756842787055 ** -np.arange(1.0, 7.0)
-    tangents = (np.outer(np.arange(1, _N_SWEPT + 1), powers) % 1 * 2 - 1) * _FAR
-    T = perturb(T_start, tangents)
-    scores = np.concatenate([alignment.shares(batch).sum(axis=1) for batch in np.split(T, _N_SWEPT // 64)])
-    return list(T[np.argsort(-scores)[:_N_KEPT]])
-
-
-def _search(alignment: Alignment, starts: list[Array], T_prior: Array, held: Array) -> list[Array]:
+def _search(alignment: Alignment, T_prior: Array, held: Array) -> list[Array]:
     """Find maxima of the score and the prior, the highest first."""
     coarse = alignment.coarser()
-    coarsest = coarse.coarser()
-    blunt = sorted((_climb(coarsest, T, T_prior, held) for T in starts), key=lambda each: -each[1])
-    found = [_climb(alignment, starts[0], T_prior, held)]
-    for T, _ in blunt[:_N_FINE]:
-        T, _ = _climb(coarse, T, T_prior, held)
-        found.append(_climb(alignment, T, T_prior, held))
+    found = [_climb(alignment, T_prior, T_prior, held)]
+    T = T_prior
+    for blunt in (coarse.coarser(), coarse, alignment):
+        T, height = _climb(blunt, T, T_prior, held)
+    found.append((T, height))
     T = max(found, key=lambda each: each[1])[0]
     _, curvatures = alignment.expand(T)
     bend = _positive(-curvatures.sum(axis=0) * np.outer(_UNIT, _UNIT)) + held

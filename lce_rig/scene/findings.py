@@ -115,12 +115,6 @@ EVENTS_OF_STANDING_RIG = Kind(
     "move the rig slowly past upright edges, or record images as well",
     severity="warning",
 )
-BEST_UNCERTAIN = Kind(
-    "scene.best_uncertain",
-    "the best extrinsics in all axes together are uncertain: {axes:motion}",
-    _BOARD,
-    severity="warning",
-)
 AXIS_UNCHANGED = Kind(
     "scene.axis_unchanged", "scene, {subject:motion}: no change of {smallest:size} or more", severity="note"
 )

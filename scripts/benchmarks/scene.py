@@ -1,7 +1,6 @@
-"""The scene as a witness: false alarms, changes seen, truth of the smallest change, joint maximum, time."""
+"""The scene as a witness: false alarms, changes seen, truth of the smallest change."""
 
 import tempfile
-import time
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import MOTIONS, Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
-from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.geometry import Array, perturb
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.pair_drift import PairDrift, Seen
 from lce_rig.pipeline.watch_drift import SceneCaptures
@@ -31,7 +30,6 @@ _OF_ONE_RIG = (("rlfs01", "rlfs02"), ("rlfs02", "rlfs01"))
 _PART = 5
 _N_ROOMS = 10
 _STATES = ("changed", "unchanged", "unknown")
-_CHI2_99 = 16.8  # of 6 axes
 _SIZES = (
     np.array([0.05, 0.05, 0.05, *np.radians([1.0, 0.5, 1.0])]),
     np.array([0.03, 0.03, 0.03, *np.radians([0.3, 0.3, 0.3])]),
@@ -48,7 +46,6 @@ class _Watched:
     samples: list[Seen]
     views: list[SceneView]
     ignore_board: bool
-    edges_ms: float = 0.0
 
     @classmethod
     def recorded(cls, recorded: RecordedSet, *, ignore_board: bool) -> "_Watched":
@@ -58,9 +55,7 @@ class _Watched:
             session = Session.open(Path(folder) / "session")
             (c,) = lce.calibrate(session).pairs
             samples = _samples(session, c)
-            start = time.perf_counter()
             views = [build_view(session.rig, c, each.name, each.image, each.scan) for each in samples]
-            edges_ms = 1000 * (time.perf_counter() - start) / len(samples)
             if ignore_board:
                 finder = BoardFinder(session.rig)
                 views = [
@@ -68,7 +63,7 @@ class _Watched:
                     for view, each in zip(views, samples, strict=True)
                     if isinstance(each.image, Image)
                 ]
-        return cls(session.rig, c, samples, views, ignore_board, edges_ms)
+        return cls(session.rig, c, samples, views, ignore_board)
 
     @classmethod
     def room(cls, seed: int, *, ignore_board: bool) -> "_Watched":
@@ -110,10 +105,10 @@ class _Watched:
                 captures.kept[0].take(each)
         return captures.judge().pairs[0]
 
-    def judge(self, views: list[SceneView], tangent: Array, *, is_joint: bool = False) -> Drift:
+    def judge(self, views: list[SceneView], tangent: Array) -> Drift:
         """Watch the board calibration, moved by a tangent."""
         c = self.calibration
-        return watch(views, self.lens, perturb(c.T_cam_lidar, tangent), c.cov, is_joint=is_joint)
+        return watch(views, self.lens, perturb(c.T_cam_lidar, tangent), c.cov)
 
 
 def _samples(session: Session, c: Calibration) -> list[Seen]:
@@ -137,7 +132,6 @@ def bench_scene(n_splits: int, only: str = "") -> None:
             parts["rooms"] = [part for room in rooms for part in room.parts(1)]
         _print_unchanged(watched, parts)
         _print_changed(parts)
-        _print_joint(watched, n_splits)
         if ignore_board:
             _print_beside(watched, parts)
 
@@ -155,8 +149,8 @@ def _print_unchanged(watched: dict[str, _Watched], parts: dict[str, list["_Part"
         for own, views in parts[target]:
             deployed = own.calibration if source == target else watched[source].calibration
             arguments = (own.lens, deployed.T_cam_lidar, deployed.cov)
-            states[watch(views, *arguments, is_joint=False).state] += 1
-            mirrored[watch(list(map(_mirrored, views)), *arguments, is_joint=False).state] += 1
+            states[watch(views, *arguments).state] += 1
+            mirrored[watch(list(map(_mirrored, views)), *arguments).state] += 1
         shown = (states["unchanged"], states["unknown"], states["changed"])
         print_row(source, target, len(parts[target]), *shown, _counts(mirrored))
 
@@ -223,77 +217,6 @@ def _outcome(drift: Drift, axis: int, size: float) -> list[str]:
     if drift.state == "unknown":
         return ["unknown"]
     return ["below" if size < verdict.smallest else "false"]
-
-
-def _print_joint(watched: dict[str, _Watched], n_splits: int) -> None:
-    print("\nJoint maximum against the board calibration; cost\n")
-    print_head(
-        "set", "captures", "rotation x, y, z deg", "translation x, y, z mm", "claimed deg", "claimed mm",
-        "chi2 of 6", "rms of parts deg", "rms of parts mm", "chi2 of parts", "edges, fields ms", "search ms",
-    )  # fmt: skip
-    for name, own in watched.items():
-        views = own.seen(own.views)
-        start = time.process_time()
-        drift = own.judge(views, np.zeros(6), is_joint=True)
-        search_ms = 1000 * (time.process_time() - start) / len(views)
-        T, cov = own.calibration.T_cam_lidar, own.calibration.cov
-        moved = difference(drift.T_best, T) * _UNIT
-        claimed = np.sqrt(np.diag(_cov_best(drift))) * _UNIT
-        parts = [own.judge(part, np.zeros(6), is_joint=True) for _, part in own.parts(n_splits)]
-        rms = np.sqrt(np.mean([(difference(part.T_best, T) * _UNIT) ** 2 for part in parts], axis=0))
-        chi2 = [_chi2(part, T, cov) for part in parts]
-        figures = [
-            _figures(row, digits)
-            for row, digits in ((moved[3:], 2), (moved[:3], 0), (claimed[3:], 2), (claimed[:3], 0))
-        ]
-        of_parts = (_figures(rms[3:], 2), _figures(rms[:3], 0), f"{min(chi2):.0f} to {max(chi2):.0f}")
-        cost = (f"{own.edges_ms:.0f}", f"{search_ms:.0f}")
-        print_row(name, len(views), *figures, f"{_chi2(drift, T, cov):.0f}", *of_parts, *cost)
-    print("\nStarts off in all axes, 16 of each kind; five captures\n")
-    print_head(
-        "set",
-        "off by",
-        "back within .3 deg, 3 cm",
-        "within the claim",
-        "neither, but uncertain",
-        "all-clears",
-    )
-    for name, own in watched.items():
-        T_best = own.judge(own.seen(own.views), np.zeros(6), is_joint=True).T_best
-        for angle_deg, shift_m in ((1.0, 0.04), (3.0, 0.20)):
-            _print_basin(name, own, T_best, angle_deg, shift_m)
-
-
-def _cov_best(drift: Drift) -> Array:
-    assert drift.cov_best is not None
-    return drift.cov_best
-
-
-def _chi2(drift: Drift, T: Array, cov: Array) -> float:
-    off = difference(drift.T_best, T)
-    return float(off @ np.linalg.solve(_cov_best(drift) + cov, off))
-
-
-def _print_basin(name: str, own: _Watched, T_best: Array, angle_deg: float, shift_m: float) -> None:
-    """Start from extrinsics off in all axes and count how many searches end at the same place."""
-    rng = np.random.default_rng(1)
-    tally: Counter[str] = Counter()
-    n, views = 16, own.seen(own.views[:_PART])
-    for _ in range(n):
-        direction = rng.standard_normal((2, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        tangent = np.concatenate([shift_m * direction[0], np.radians(angle_deg) * direction[1]])
-        drift = own.judge(views, tangent, is_joint=True)
-        left = difference(drift.T_best, T_best)
-        is_back = np.linalg.norm(left[3:]) < np.radians(0.3) and np.linalg.norm(left[:3]) < 0.03
-        is_within = _chi2(drift, T_best, np.zeros((6, 6))) < _CHI2_99
-        is_open = any(finding.code == "scene.best_uncertain" for finding in drift.findings)
-        tally["back"] += bool(is_back)
-        tally["within"] += is_within
-        tally["open"] += is_open and not (is_back or is_within)
-        tally["clear"] += drift.state == "unchanged"
-    figures = (tally["back"], tally["within"], tally["open"], tally["clear"])
-    print_row(name, f"{angle_deg:g} deg, {100 * shift_m:g} cm", *figures)
 
 
 def _figures(values: Array, digits: int) -> str:

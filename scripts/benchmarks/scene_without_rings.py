@@ -93,7 +93,7 @@ def _print_random(n_views: int, views: Sequence[SceneView], lens: Intrinsics, T:
         for _ in range(_N_RANDOM):
             tangent = rng.uniform(-1, 1, 6) * np.where(IS_ROTATION, np.radians(turn_deg), shift_m)
             chosen = [views[k] for k in rng.permutation(len(views))[:n_views]]
-            states[watch(chosen, lens, perturb(T, tangent), _COV, is_joint=False).state] += 1
+            states[watch(chosen, lens, perturb(T, tangent), _COV).state] += 1
         print_row(f"{turn_deg:g} deg, {1000 * shift_m:g} mm", _N_RANDOM, *(states[each] for each in _STATES))
 
 
@@ -102,7 +102,7 @@ def _judged(groups: Iterable[_Group], tangents: Sequence[Array], axis: str = "")
     tally: Counter[str] = Counter()
     for views, lens, T in groups:
         for tangent in tangents:
-            drift = watch(views, lens, perturb(T, tangent), _COV, is_joint=False)
+            drift = watch(views, lens, perturb(T, tangent), _COV)
             changes = [each for each in drift.axes if each.state == "changed"]
             tally[drift.state] += 1
             tally["named"] += any(axis in (each.axis, *each.instead) for each in changes)

@@ -13,11 +13,11 @@ from lce_rig.scene.drift import watch
 from lce_rig.scene.edge_field import build_edge_field
 
 
-def judge(seen, tangent=(0.0,) * 6, views=None, is_joint=False):
+def judge(seen, tangent=(0.0,) * 6, views=None):
     c = seen.truth
     lens = seen.rig.cameras["cam"].to_intrinsics()
     moved = perturb(c.T_cam_lidar, np.array(tangent))
-    return watch(seen.views if views is None else views, lens, moved, c.cov, is_joint=is_joint)
+    return watch(seen.views if views is None else views, lens, moved, c.cov)
 
 
 def along(axis, size):
@@ -25,12 +25,9 @@ def along(axis, size):
 
 
 def test_the_truth_is_unchanged(seen):
-    drift = judge(seen, is_joint=True)
+    drift = judge(seen)
     assert drift.state == "unchanged"
     assert all(abs(axis.change) < 2 * axis.sigma for axis in drift.axes)
-    tangent = difference(drift.T_best, seen.truth.T_cam_lidar)
-    assert np.degrees(np.linalg.norm(tangent[3:])) < 0.4
-    assert np.linalg.norm(tangent[:3]) < 0.025
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -57,21 +54,10 @@ def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign):
 
 def test_changes_of_two_axes_are_both_seen(seen):
     turned = along("rotation_y", np.radians(1.0)) + along("rotation_x", np.radians(1.2))
-    drift = judge(seen, turned, is_joint=True)
+    drift = judge(seen, turned)
     assert {axis.axis for axis in drift.axes if axis.state == "changed"} >= {"rotation_y"}
-    left = difference(drift.T_best, seen.truth.T_cam_lidar)
+    left = difference(drift.T_changed, seen.truth.T_cam_lidar)
     assert np.degrees(np.linalg.norm(left[3:])) < 0.5
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_uncertain(seen, seed):
-    shift, turn = np.random.default_rng(seed).standard_normal((2, 3))
-    start = (*0.2 * shift / np.linalg.norm(shift), *np.radians(3.0) * turn / np.linalg.norm(turn))
-    drift = judge(seen, start, is_joint=True)
-    assert drift.state != "unchanged"
-    error = difference(drift.T_best, seen.truth.T_cam_lidar)
-    is_uncertain = "scene.best_uncertain" in [finding.code for finding in drift.findings]
-    assert is_uncertain or float(error @ np.linalg.solve(drift.cov_best, error)) < 16.8
 
 
 @pytest.mark.parametrize("size_deg", [4.0, 8.0, -15.0])

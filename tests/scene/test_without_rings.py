@@ -32,9 +32,7 @@ def seen():
 
 def judge(seen, tangent=(0.0,) * 6):
     c = seen.truth
-    return watch(
-        seen.views, seen.rig.lens_of(c), perturb(c.T_cam_lidar, np.array(tangent)), c.cov, is_joint=False
-    )
+    return watch(seen.views, seen.rig.lens_of(c), perturb(c.T_cam_lidar, np.array(tangent)), c.cov)
 
 
 def test_the_truth_has_no_change(seen):
