@@ -18,7 +18,7 @@ from tests.shared import has_ended, wait_until
 def absent(tmp_path):
     """The profile of a rig of which nothing is attached."""
     path = tmp_path / "absent.yaml"
-    with attach(Attached(make_rig(), has_board=False), tmp_path) as (rig, _):
+    with attach(Attached(make_rig(), has_board=False), tmp_path) as rig:
         path.write_text(dump_rig(rig))
     return path
 
@@ -51,7 +51,7 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     rig = make_rig(lidars={"lidar": {"timestamps": {"clock": "utc", "reference": "first_firing"}}})
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
     attached = Attached(rig, PIXELS, SCAN, unlocked, has_board=False)
-    with attach(attached, tmp_path) as (reached, _):
+    with attach(attached, tmp_path) as reached:
         path = tmp_path / "rig.yaml"
         path.write_text(dump_rig(reached.model_copy(update={"sync": None})))
         for duration_s in ("2", "6", "18"):  # longer where a computer that is busy with others sends too late
@@ -67,7 +67,7 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
 
 def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
     rig = make_rig(sync=None)
-    with attach(Attached(rig, PIXELS, has_board=False), tmp_path) as (reached, _):
+    with attach(Attached(rig, PIXELS, has_board=False), tmp_path) as reached:
         document = reached.model_dump()
         document["sync"] = None
         code, *arguments = document["cameras"]["cam"]["driver"]["command"][2:]
