@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
     from lce_rig.export.extrinsics import Reference, read_reference
-    from lce_rig.io.protocol import SourceOptions
+    from lce_rig.io.recording import SourceOptions
     from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
@@ -110,7 +110,7 @@ _HOMES = {
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
-    "lce_rig.io.protocol": ("SourceOptions",),
+    "lce_rig.io.recording": ("SourceOptions",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -18,7 +18,7 @@ from lce_rig.collect.offline import CollectOptions
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.pipeline.collect_recordings import fill_session
 from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session

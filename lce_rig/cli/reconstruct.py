@@ -11,8 +11,8 @@ from lce_rig.cli.options import FiniteRange, path_option
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.phrasing import significant
-from lce_rig.detect.events.noise import measure_flicker
 from lce_rig.detect.events.reconstructor import Reconstructor
+from lce_rig.detect.events.windows import measure_flicker
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
 from lce_rig.show.overlays.canvas import write_picture

@@ -8,8 +8,13 @@ from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.rig import Rig
-from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns
-from lce_rig.timing.scan_pairing import PATIENCE_NS, middle_of_sweep_ns
+from lce_rig.timing.scan_pairing import (
+    PATIENCE_NS,
+    event_channel,
+    middle_of_sweep_ns,
+    rig_offset_ns,
+    rig_time_ns,
+)
 
 _NOT_BEGUN = READ_EVENTS_NOT_BEGUN.refusal()
 _GONE_BY = READ_EVENTS_GONE_BY.refusal()

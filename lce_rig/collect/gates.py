@@ -26,8 +26,7 @@ from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
 from lce_rig.detect.limits_met import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.rig import Rig
-from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import EventCut
+from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
 # For how long a board has to stand still at least, and for how many scans.
 _WINDOW_S, _WINDOW_SCANS = 0.5, 2.5

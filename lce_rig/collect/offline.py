@@ -20,8 +20,14 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.io.folder import FolderRecording
-from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
-from lce_rig.io.protocol import ContinuousRecording, Recording, serials_of
+from lce_rig.io.recording import (
+    ContinuousRecording,
+    Recording,
+    check_overlap,
+    join_recordings,
+    require_sensors,
+    serials_of,
+)
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time

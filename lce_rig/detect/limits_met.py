@@ -10,7 +10,7 @@ from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, busiest_events
-from lce_rig.detect.events.noise import hot_pixels, measure_flicker
+from lce_rig.detect.events.windows import hot_pixels, measure_flicker
 from lce_rig.detect.findings import (
     IMAGE_FEW_EVENTS,
     IMAGE_FLICKER,

@@ -29,7 +29,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.registry import Registry, Row, Status, with_pairs, write_rows
 from lce_rig.fleet.storage import Storage
-from lce_rig.io.protocol import fingerprint
+from lce_rig.io.recording import fingerprint
 from lce_rig.pipeline.result_files import OVERLAYS
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session

@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io import findings as findings  # Readers may name their kinds by code.
-from lce_rig.io.protocol import Recording, SourceOptions, choose_lidar
+from lce_rig.io.recording import Recording, SourceOptions, choose_lidar
 from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
 from lce_rig.rig import Rig
 

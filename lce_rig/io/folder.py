@@ -18,7 +18,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
 from lce_rig.io.findings import NOT_DECODED, worded
-from lce_rig.io.protocol import (
+from lce_rig.io.recording import (
     SourceOptions,
     choose_camera,
     choose_lidar,

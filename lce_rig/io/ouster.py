@@ -20,7 +20,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
 from lce_rig.io import findings
 from lce_rig.io.network import FRAME_BYTES, PcapFile
-from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
+from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
 # A scan with more of its columns lost is not worth looking at.

@@ -20,9 +20,8 @@ from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
-from lce_rig.io.joining import follows
 from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
-from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
+from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint, follows
 from lce_rig.io.velodyne_packets import (
     BadPacketError,
     DataPacket,

@@ -9,7 +9,7 @@ from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress, silent
 from lce_rig.io import open_recordings
-from lce_rig.io.protocol import Recording, SourceOptions
+from lce_rig.io.recording import Recording, SourceOptions
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 

@@ -35,7 +35,7 @@ from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, esti
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.show.overlays.canvas import write_picture
 from lce_rig.show.overlays.overlay import draw_edges
-from lce_rig.timing.rig_time import event_channel, rig_time_ns
+from lce_rig.timing.scan_pairing import event_channel, rig_time_ns
 
 _MIN_MOVING = 3
 _MAX_BOARDS = 20

@@ -23,8 +23,7 @@ from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
-from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
-from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.io.recording import ContinuousRecording, check_overlap, join_recordings, require_sensors
 from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, PairJudge, Seen, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import with_lenses_of
@@ -33,8 +32,15 @@ from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES
 from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
-from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, stream_of
-from lce_rig.timing.scan_pairing import EventCut, Frame, pair_by_time
+from lce_rig.timing.scan_pairing import (
+    EventCut,
+    Frame,
+    event_channel,
+    pair_by_time,
+    rig_offset_ns,
+    rig_time_ns,
+    stream_of,
+)
 
 _LIVE_WAIT_S = 0.2
 

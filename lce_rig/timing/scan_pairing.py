@@ -1,4 +1,4 @@
-"""Streams of several sensors cut into frames: one scan, and what the others saw at about that time."""
+"""The rig's time, common to all sensors, and streams cut into frames: a scan and what others saw then."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -8,11 +8,47 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lce_rig.core.data import Events, Image, Sample, Scan, join_events
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
 from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig
 from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER_SCAN
-from lce_rig.timing.rig_time import rig_offset_ns, rig_time_ns, stream_of
+
+
+def event_channel(rig: Rig, camera: str) -> str | None:
+    """Name a camera's channel of kind events; None where it has none."""
+    return rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
+
+
+def stamp_of(sample: Sample) -> int | None:
+    """Read a sample's timestamp, a packet's first, ns on the sensor's own clock; None without one."""
+    if isinstance(sample, Events):
+        return int(sample.t_ns[0]) if len(sample) else None
+    return sample.stamp_ns
+
+
+def stream_of(sample: Sample, rig: Rig) -> Stream:
+    """Name the stream that a sample belongs to."""
+    if isinstance(sample, Events):
+        return Stream(sample.sensor, event_channel(rig, sample.sensor) or "", "events")
+    if isinstance(sample, Image):
+        return Stream(sample.sensor, sample.channel, "images")
+    return Stream(sample.sensor, "", "scans")
+
+
+def rig_offset_ns(stream: Stream, rig: Rig) -> int:
+    """Return the profile's offset from a stream's timestamps to the rig's time."""
+    if stream.kind == "scans":
+        timestamps = rig.lidars[stream.sensor].timestamps
+    else:
+        timestamps = rig.cameras[stream.sensor].channels[stream.channel].timestamps
+    return round(timestamps.expected_offset_s * 1e9)
+
+
+def rig_time_ns(sample: Sample, rig: Rig) -> int | None:
+    """Bring a sample's timestamp to the rig's time; None where it carries none."""
+    stamp_ns = stamp_of(sample)
+    return None if stamp_ns is None else stamp_ns + rig_offset_ns(stream_of(sample, rig), rig)
+
 
 BEFORE_NS = 1_200_000_000
 """Kept before a scan's first firing, for the network to settle ..."""

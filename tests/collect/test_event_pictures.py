@@ -9,7 +9,7 @@ from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Losses
 from lce_rig.detect.events.reconstructor import Reconstructor
-from lce_rig.io.joining import merge_by_time
+from lce_rig.io.recording import merge_by_time
 from lce_rig.rig import load_rig
 
 from .event_sightings import T0_NS, event_stream

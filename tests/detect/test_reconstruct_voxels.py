@@ -8,8 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moving_board import Motion, board_events, events_of, join, lamps, noise
 
-from lce_rig.detect.events.noise import hot_pixels, measure_flicker, without_background_activity
-from lce_rig.detect.events.windows import normalise_voxels, voxel_grid
+from lce_rig.detect.events.windows import (
+    hot_pixels,
+    measure_flicker,
+    normalise_voxels,
+    voxel_grid,
+    without_background_activity,
+)
 from lce_rig.io.events import open_events
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.events import open_events
-from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.io.recording import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import BagRecorder
 
 T0_NS = 1_700_000_000_123_456_789

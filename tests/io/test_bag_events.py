@@ -8,7 +8,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.timing.rig_time import rig_time_ns
+from lce_rig.timing.scan_pairing import rig_time_ns
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 from tests.shared import changed

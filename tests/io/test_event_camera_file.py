@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.protocol import serials_of
+from lce_rig.io.recording import serials_of
 from lce_rig.rig import load_rig
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis

@@ -9,7 +9,13 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings, merge_by_time, require_sensors
+from lce_rig.io.recording import (
+    JoinedRecording,
+    check_overlap,
+    join_recordings,
+    merge_by_time,
+    require_sensors,
+)
 from tests.notes import has_note
 from tests.shared import changed
 

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.rig import load_rig
 from tests.shared import changed
 

@@ -17,7 +17,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram
 from lce_rig.io.ouster import PROFILES, OusterRecording, read_metadata
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.rig import load_rig
 from tests.damage import damaged
 

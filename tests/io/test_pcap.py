@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io.network import Datagram, PcapFile
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
 from tests.damage import damaged
 from tests.notes import has_note

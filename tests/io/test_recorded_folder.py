@@ -7,9 +7,8 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import list_parts, open_recordings
-from lce_rig.io.joining import check_overlap, join_recordings
 from lce_rig.io.network import Datagram
-from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.recording import ContinuousRecording, SourceOptions, check_overlap, join_recordings
 from lce_rig.io.ros.bag_recorder import BagRecorder
 
 from .pcap_files import write_datagrams

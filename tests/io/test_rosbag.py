@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.io.recording import ContinuousRecording
 from lce_rig.rig import load_rig
 from tests.damage import damaged
 from tests.notes import has_note

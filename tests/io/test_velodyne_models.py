@@ -8,7 +8,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile
 from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.io.ros.messages import deserialize, typestore

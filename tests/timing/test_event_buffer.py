@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Losses
-from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, pair_by_time
+from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, pair_by_time, rig_time_ns
 from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9

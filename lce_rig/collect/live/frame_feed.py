@@ -13,8 +13,7 @@ from lce_rig.devices.reading import AttachedSensors, Inbox
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
-from lce_rig.timing.rig_time import event_channel
-from lce_rig.timing.scan_pairing import LIVE_NS, Frame, pair_by_time
+from lce_rig.timing.scan_pairing import LIVE_NS, Frame, event_channel, pair_by_time
 
 _WAIT_S = 0.1
 _REFRESH_S = 0.5

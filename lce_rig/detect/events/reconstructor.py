@@ -14,9 +14,9 @@ from lce_rig.core.data import Events, Image, join_events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.detect.events.noise import NoiseFilter
 from lce_rig.detect.events.windows import (
     FloatArray,
+    NoiseFilter,
     WindowRule,
     active_share,
     normalise_voxels,

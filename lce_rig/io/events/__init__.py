@@ -11,8 +11,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError
 from lce_rig.io.findings import worded
-from lce_rig.io.joining import follows, merge_by_time
-from lce_rig.io.protocol import SourceOptions, choose_event_camera, fingerprint
+from lce_rig.io.recording import SourceOptions, choose_event_camera, fingerprint, follows, merge_by_time
 from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
 from lce_rig.rig import Rig
 

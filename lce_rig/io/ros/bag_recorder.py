@@ -20,7 +20,7 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 from lce_rig.rig import LidarSettings, Rig
-from lce_rig.timing.rig_time import event_channel
+from lce_rig.timing.scan_pairing import event_channel
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"

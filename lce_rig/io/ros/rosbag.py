@@ -13,8 +13,7 @@ from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError
 from lce_rig.io.findings import worded
-from lce_rig.io.joining import follows, merge_by_time
-from lce_rig.io.protocol import SourceOptions, fingerprint
+from lce_rig.io.recording import SourceOptions, fingerprint, follows, merge_by_time
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.messages import (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.recording import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import EVENT_TYPES, read_event_head
 from lce_rig.io.ros.messages import (
