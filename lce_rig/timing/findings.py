@@ -25,8 +25,7 @@ BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count"
 CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
 SLIPPED = note_kind(
     "pulses.slipped",
-    "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
-    "{n_matched} images matched, {n_unmatched} not",
+    "its images were matched to the pulses anew {n_restarts} times; {n_matched} matched, {n_unmatched} not",
 )
 
 NO_EDGES = Kind("edges.none_seen", "no edges detected yet", "wire its trigger input, and switch it on")

@@ -153,7 +153,7 @@ class RigClock:
         self._matchers: dict[str, TriggerMatcher] = {}
         self._edges: dict[str, EdgeClock] = {}
         self._edge_models: dict[str, ClockModel | None] = {}
-        self._is_slow = False
+        self._quick: list[TriggerMatcher] = []
         is_tied = has_board and rig.sync is not None
         triggers = rig.sync.triggers if rig.sync is not None else {}
         for name in rig.cameras if is_tied else ():
@@ -162,12 +162,13 @@ class RigClock:
             elif name in triggers:
                 trigger = triggers[name]
                 self._matchers[name] = TriggerMatcher(name, round(1e9 * trigger.max_delay_s))
-                self._is_slow |= trigger.rate_hz * trigger.max_delay_s >= 1
+                if trigger.rate_hz * trigger.max_delay_s >= 1:
+                    self._quick.append(self._matchers[name])
 
     @property
     def needs_slow_triggers(self) -> bool:
         """Whether pulses at the profile's rates are too quick to tell yet which made which image."""
-        return self._is_slow
+        return any(matcher.problem is not None for matcher in self._quick)
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
         """Take a sample of a source, and give those whose time is now known, on the rig's clock."""
@@ -218,8 +219,6 @@ class RigClock:
             edges.set_clock(self._host.inverse())
             model = self._edge_models[name] = edges.fit()
             self._tie(name, None if model is None else model.then(board_clock))
-        if all(matcher.problem is None for matcher in self._matchers.values()):
-            self._is_slow = False
 
     def edge_clock(self, camera: str) -> tuple[ClockModel | None, Finding | None]:
         """Return the board's time on the clock of a camera that stamps its edges; or why there is none."""
@@ -232,11 +231,11 @@ class RigClock:
         return [problem for problem in matchers + edges if problem is not None]
 
     def account(self) -> list[Finding]:
-        """List the cameras whose counts slipped against their pulses so far."""
+        """List the cameras whose counts, or those of their pulses, began anew so far."""
         return [
             Finding(findings.SLIPPED.code, findings.SLIPPED.severity, name, matcher.figures())
             for name, matcher in self._matchers.items()
-            if matcher.counts["n_slips"] or matcher.counts["n_restarts"]
+            if matcher.counts["n_restarts"]
         ]
 
     def verdict(self) -> SyncVerdict:

@@ -3,7 +3,8 @@
 A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, which a few
 images at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
 nor a lost line can mix them up. The camera's timestamps still check the constant: a pulse that the camera
-missed, or a frame that its driver did not number, shifts every later image by whole pulses.
+missed, or a frame that its driver did not number, shifts every later image by whole pulses, and the constant
+is sought again.
 """
 
 from bisect import bisect_left
@@ -22,12 +23,8 @@ N_AGREE = 4
 
 _N_WAITING = 64
 _N_DELAYS = 31
-# A camera that misses more pulses at once has been set up again.
-_MAX_SLIP = 8
 # Of the time between two pulses: nearer than this, an image belongs to the pulse and to no other.
 _NEAR = 0.3
-_N_SLIPS_DOUBTFUL = 3
-_SLIP_WINDOW = 200
 _N_PULSES = 1024
 _N_RECENT = 8
 _MAX_INTERPOLATED = 8
@@ -59,8 +56,8 @@ class TriggerMatcher:
     """Pulses and images of one camera in, matched images out, each stream in its own order.
 
     Attributes:
-        counts: n_matched images, n_unmatched, n_lost_frames and n_repeated ones; pulses n_missed by the
-            camera; corrections of the constant, n_slips, and n_restarts of either count.
+        counts: n_matched images, n_unmatched, n_lost_frames and n_repeated ones; n_restarts of either count,
+            or of the search for the constant.
         problem: why images are not matched now; None while they are.
     """
 
@@ -82,9 +79,8 @@ class TriggerMatcher:
         self._constant: int | None = None
         self._candidate: int | None = None
         self._delays_ns: deque[int] = deque(maxlen=_N_DELAYS)
-        self._doubtful: list[_Waiting] = []
+        self._n_odd = 0
         self._last: tuple[int, int] | None = None
-        self._slipped_at: deque[int] = deque(maxlen=_N_SLIPS_DOUBTFUL)
 
     def set_clock(self, board_from_camera: ClockModel) -> None:
         """Take the board's time on the camera's clock, by which the start is found."""
@@ -168,49 +164,22 @@ class TriggerMatcher:
     def _follow(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         """Match by number, and keep an eye on the time."""
         assert self._constant is not None
-        if self._pulses.time_of(frame.number - self._constant) is None:
-            self.counts["n_unmatched"] += 1
-            return
-        shift = self._shift(frame)
-        if shift == 0:
-            # What looked like a slip was an image with a late timestamp.
-            doubtful, self._doubtful = self._doubtful, []
-            for image in (*doubtful, frame):
-                yield from self._emit(image)
-            pulse = self._pulses.time_of(frame.number - self._constant)
-            if pulse is not None:
-                self._delays_ns.append(frame.board_ns - pulse)
-            return
-        self._doubtful.append(frame)
-        if len(self._doubtful) < N_AGREE:
-            return
-        # Several images in a row are at odds with their pulses' times.
-        doubtful, self._doubtful = self._doubtful, []
-        shifts = {self._shift(image) for image in doubtful}
-        shift = shifts.pop()
-        slips = self._slipped_at
-        is_slipping = len(slips) == _N_SLIPS_DOUBTFUL and frame.number - slips[0] < _SLIP_WINDOW
-        if shifts or shift is None or is_slipping:
-            self._drop(doubtful)
-            self._restart(findings.PULSES_NOT_FOLLOWED)
-            return
-        self._constant -= shift
-        self.counts["n_slips"] += 1
-        self.counts["n_missed"] += max(shift, 0)
-        self._slipped_at.append(doubtful[-1].number)
-        for image in doubtful:
-            yield from self._emit(image)
-
-    def _shift(self, frame: _Waiting) -> int | None:
-        """Return by how many pulses an image's time is off its number's; None where it is between pulses."""
-        assert self._constant is not None
         number = frame.number - self._constant
-        made_ns = frame.board_ns - round(median(self._delays_ns))
         pulse = self._pulses.time_of(number)
         if pulse is None:
-            return 0
-        off = (made_ns - pulse) / self._pulses.period_ns(number)
-        return round(off) if abs(off - round(off)) < _NEAR and abs(off) < _MAX_SLIP else None
+            self.counts["n_unmatched"] += 1
+            return
+        late_ns = frame.board_ns - pulse - round(median(self._delays_ns))
+        if abs(late_ns) < _NEAR * self._pulses.period_ns(number):
+            self._n_odd = 0
+            yield from self._emit(frame)
+            self._delays_ns.append(frame.board_ns - pulse)
+            return
+        # One timestamp may be late; several in a row tell that the counts have slipped.
+        self.counts["n_unmatched"] += 1
+        self._n_odd += 1
+        if self._n_odd == N_AGREE:
+            self._restart(findings.PULSES_NOT_FOLLOWED)
 
     def _emit(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         assert self._constant is not None
@@ -225,18 +194,15 @@ class TriggerMatcher:
     def _restart(self, reason: Kind) -> None:
         self.problem = reason(self._camera)
         self.counts["n_restarts"] += 1
-        for frames in (self._waiting, self._agreeing, self._doubtful):
+        for frames in (self._waiting, self._agreeing):
             self._drop(frames)
         self._constant = self._candidate = self._last = None
         self._delays_ns.clear()
-        self._slipped_at.clear()
+        self._n_odd = 0
 
     def figures(self) -> dict[str, Figure]:
         """Return the counts for a finding."""
-        return {
-            name: self.counts[name]
-            for name in ("n_matched", "n_unmatched", "n_missed", "n_slips", "n_restarts")
-        }
+        return {name: self.counts[name] for name in ("n_matched", "n_unmatched", "n_restarts")}
 
     def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
         self.counts["n_unmatched"] += len(frames)

@@ -133,7 +133,7 @@ def test_a_pulse_that_the_camera_missed_is_found_and_told():
         number += 1
     assert abs(int(placed[-1].stamp_ns or 0) - T0_NS - sent_ns - 10_000_000) < 1_000_000
     (slipped,) = clock.account()
-    assert (slipped.code, slipped.subject, slipped.figures["n_slips"]) == ("pulses.slipped", "cam", 1)
+    assert (slipped.code, slipped.subject, slipped.figures["n_restarts"]) == ("pulses.slipped", "cam", 1)
 
 
 def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate():
