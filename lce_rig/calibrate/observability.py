@@ -6,9 +6,8 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import vec_rotation, with_one
-from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.findings import UNDETERMINED
-from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, CaptureFeatures
 from lce_rig.core.calibration import MOTIONS, Motion, WeakestMotion
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array

@@ -5,9 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observations import group_placements
-from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
+from lce_rig.calibrate.plane_and_ends import ends_on_board, extract_features, plane_residuals
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.calibrate.tolerances import Sensitivity

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
-from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.plane_and_ends import differentiate, end_rows
+from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
 from lce_rig.calibrate.tolerances import PoseErrors, Sensitivity, Source, Tolerances, pose_errors

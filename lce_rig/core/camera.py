@@ -1,6 +1,6 @@
 """Camera models: pixels from points and rays from pixels, with their range of validity."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -8,9 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
-
-# Step of the distortion's derivative, px in the image's corner.
-_BENT_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -198,27 +195,6 @@ class Intrinsics:
                 slope[..., 0, 1] = slope[..., 1, 0] = by_xy / z
                 slope[..., 0, 2], slope[..., 1, 2] = -(by_x * a + by_xy * b) / z, -(by_xy * a + by_y * b) / z
         return np.asarray(slope * np.array([self.fx_px, self.fy_px])[:, None])
-
-    def differentiate_by_errors(self, points_camera: Array) -> Array:
-        """Differentiate `project` by errors of the intrinsics.
-
-        Args:
-            points_camera: (..., 3) m, frame camera optical.
-
-        Returns:
-            (..., 2, 4) px: per relative error of both focal lengths; per pixel of the principal point, x and
-            y; per pixel by which the distortion's cubic term displaces the image's corner outwards. Zero
-            where `project` is not valid.
-        """
-        pixels, is_valid = self.project(points_camera)
-        radius = np.hypot(self.width_px, self.height_px) / 2 / self.fx_px
-        k1, *others = self.distortion or (0.0,) * 4
-        bent = replace(self, distortion=(k1 + _BENT_PX / (self.fx_px * radius**3), *others))
-        slope = np.zeros((*pixels.shape, 4))
-        slope[..., 0] = pixels - [self.cx_px, self.cy_px]
-        slope[..., 1:3] = np.eye(2)
-        slope[..., 3] = (bent.project(points_camera)[0] - pixels) / _BENT_PX
-        return np.where(is_valid[..., None, None], np.nan_to_num(slope), 0.0)
 
     def unproject(self, pixels: NDArray[Any]) -> Array:
         """Find the unit ray through each pixel, by Newton's method.

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.levels import Priors
 from lce_rig.calibrate.likelihood.rays import lens_fields, turn_rays
-from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows, extract_features
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array

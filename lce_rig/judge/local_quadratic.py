@@ -11,14 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import (
     EDGE_SHIFT_SIGMA_M,
     PLANE_FREEDOMS,
+    CaptureFeatures,
     differentiate,
     end_residuals,
     end_rows,
+    extract_features,
     plane_residuals,
 )
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.plane_and_ends import extract_features
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board

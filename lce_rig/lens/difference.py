@@ -100,33 +100,30 @@ def compare_lenses(
     return LensDifference(rms_px, sigma_px, log_so3(R), turn @ cov @ turn.T)
 
 
-def lens_errors(
-    given: Intrinsics, fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel
-) -> tuple[Array, Array]:
-    """Fit errors of given intrinsics, as `Intrinsics.differentiate_by_errors`, to fitted ones.
+def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> Array:
+    """Propagate the covariance of intrinsics to the errors that a profile states.
+
+    Parameters are correlated: the errors share what their covariance lets pixels move where boards were seen.
 
     Args:
-        given, fitted: for images of the same size.
-        corners_px: (n, 2) where boards were seen; the pixels' distances are least there.
-        cov: (P, P) of the fitted parameters.
-        model: of the fitted.
+        fitted: the intrinsics.
+        corners_px: (n, 2) where boards were seen.
+        cov: (P, P) of their parameters.
+        model: whose parameters these are.
 
     Returns:
-        The errors (4,), fitted less given, and their covariance (4, 4).
-
-    Raises:
-        ValueError: the given intrinsics project too few of the pixels.
+        (4, 4) of the relative error of both focal lengths, of the principal point's x and y, px, and of the
+        pixels by which the distortion's cubic term displaces the image's corner outwards.
     """
-    rays = given.unproject(corners_px)
-    is_drawn = np.isfinite(rays).all(axis=1)
-    rays = rays[is_drawn & fitted.project(np.nan_to_num(rays))[1]]
-    if len(rays) < _LEAST_ALIGNED:
-        raise ValueError("the intrinsics project too few pixels")
-    pixels, _, by_lens = model.project(model.vector(fitted), rays)
-    by_errors = given.differentiate_by_errors(rays).reshape(-1, 4)
-    solve = np.linalg.pinv(by_errors)
-    by_lens = solve @ by_lens.reshape(-1, model.size)
-    return solve @ (pixels - given.project(rays)[0]).ravel(), by_lens @ cov @ by_lens.T
+    vector, rays = model.vector(fitted), fitted.unproject(corners_px)
+    _, _, by_lens = model.project(vector, rays[np.isfinite(rays).all(axis=1)])
+    by_lens = by_lens.reshape(-1, model.size)
+    radius = np.hypot(fitted.width_px, fitted.height_px) / 2 / fitted.fx_px
+    to_lens = np.zeros((model.size, 4))
+    to_lens[:2, 0], to_lens[[2, 3], [1, 2]] = vector[:2], 1.0
+    to_lens[4, 3] = 1 / (fitted.fx_px * radius**3)
+    to_errors = np.linalg.pinv(by_lens @ to_lens) @ by_lens
+    return np.asarray(to_errors @ cov @ to_errors.T)
 
 
 def turn_of_lens(intrinsics: Intrinsics) -> Array:

@@ -35,7 +35,7 @@ from lce_rig.judge.findings import verdict_of
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
 from lce_rig.judge.lens_model import model_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
-from lce_rig.lens.difference import LensCertainty, certainty_of, lens_errors
+from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
@@ -90,14 +90,9 @@ class MeasuredIntrinsics:
         return replace(lens, **pixels, distortion=tuple(round(value, 8) for value in lens.distortion))
 
     def deviations(self) -> dict[str, float]:
-        """Compute the standard deviations of the profile's block `intrinsics`, px, by key.
-
-        Its parameters are correlated: focal length, principal point and distortion share what their
-        covariance lets pixels move where boards were seen.
-        """
+        """Compute the standard deviations of the profile's block `intrinsics`, px, by key."""
         estimate, lens = self.estimate, self.estimate.intrinsics
-        corners_px = estimate.corners_px
-        _, cov = lens_errors(lens, lens, corners_px, estimate.cov, estimate.model)
+        cov = profile_errors(lens, estimate.corners_px, estimate.cov, estimate.model)
         focal, x, y, corner_px = np.sqrt(np.diag(cov)).tolist()
         return {
             "focal_sigma_px": float(f"{focal * lens.fx_px:.2g}"),

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
-from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.plane_and_ends import extract_features
 from lce_rig.calibrate.uncertainty import moves_by_scans, systematic_covariances
 from lce_rig.core.geometry import difference, fit_plane
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate

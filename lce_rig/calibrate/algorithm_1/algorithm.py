@@ -20,11 +20,10 @@ from lce_rig.calibrate.algorithm_1.registration import (
     linear_unknowns,
     rotation_from_directions,
 )
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.findings import OUTLIER
 from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.observations import group_placements
-from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, CaptureFeatures, extract_features
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.result import Start
 from lce_rig.core.board import Board

@@ -11,8 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, describe_background, end_residuals, end_rows
+from lce_rig.calibrate.plane_and_ends import (
+    EDGE_SHIFT_SIGMA_M,
+    CaptureFeatures,
+    describe_background,
+    end_residuals,
+    end_rows,
+)
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array

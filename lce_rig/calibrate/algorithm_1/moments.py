@@ -26,8 +26,7 @@ from lce_rig.calibrate.algorithm_1.registration import (
     vec_rotation,
     with_one,
 )
-from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, residual_rows
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, CaptureFeatures, residual_rows
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose

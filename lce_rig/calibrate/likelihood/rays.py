@@ -57,13 +57,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import turn_about_z
 from lce_rig.calibrate.likelihood.layout import END, RING, Indices, State
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
     differentiate,
     distance_inside,
+    turn_about_z,
 )
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array

@@ -18,7 +18,6 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
-from lce_rig.calibrate.features import CaptureFeatures, extract_features, features_of_camera
 from lce_rig.calibrate.motion.board_motion import (
     BoardMotions,
     PoseSamples,
@@ -28,7 +27,13 @@ from lce_rig.calibrate.motion.board_motion import (
     fit_motions,
 )
 from lce_rig.calibrate.observations import Clocks, SharedScan
-from lce_rig.calibrate.plane_and_ends import along_normals, differentiate
+from lce_rig.calibrate.plane_and_ends import (
+    CaptureFeatures,
+    along_normals,
+    differentiate,
+    extract_features,
+    features_of_camera,
+)
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference

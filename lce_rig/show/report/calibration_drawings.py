@@ -9,8 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.plane_and_ends import plane_residuals
+from lce_rig.calibrate.plane_and_ends import extract_features, plane_residuals
 from lce_rig.calibrate.result import squares_scale, with_squares
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration

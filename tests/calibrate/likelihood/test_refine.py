@@ -7,11 +7,11 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.features import turn_about_z
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.plane_and_ends import turn_about_z
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.geometry import difference, exp_so3, fit_plane, invert, perturb, pose, transform
