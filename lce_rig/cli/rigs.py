@@ -111,9 +111,6 @@ def check_profile(file: str) -> None:
     metavar="KEY=VALUE",
     help="Set a key, as board.square_m=0.08; may be repeated.",
 )
-@click.option(
-    "--unset", "removed", multiple=True, metavar="KEY", help="Remove a key or a block; may be repeated."
-)
 @click.option("-o", "--output", help="File to write, - for stdout [default: NAME.yaml].")
 def new_profile(
     name: str,
@@ -123,7 +120,6 @@ def new_profile(
     intrinsics: tuple[str, ...],
     board: str | None,
     settings: tuple[str, ...],
-    removed: tuple[str, ...],
     output: str | None,
 ) -> None:
     """Write a profile NAME: for sensors of your own, from a bag of them, or derived from another profile.
@@ -132,7 +128,7 @@ def new_profile(
       lce-rig rigs new truck --lidar OS1-64 --camera front --intrinsics camera_info.yaml \\
                              --board 8x6,0.07,0.767x0.626
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
-      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
+      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --set nominal_extrinsics=[]
     """
     stem = name.removesuffix(".yaml").removesuffix(".yml")
     if stem != name:
@@ -164,17 +160,13 @@ def new_profile(
         )
         for line in lines:
             show.note(line)
-        text = edit_text(text, values, removed, target)
+        text = edit_text(text, values, target)
     else:
         origin = origin or "rlfs"
         parent = load_rig(origin)
         values = [*_sensor_settings(parent, lidar, cameras, intrinsics, board), *values]
-        if board is not None:
-            block = parent.board.model_dump(exclude_none=True, exclude_unset=True)
-            stale = block.keys() - board_block(parse_board(board)).keys() - {"type"}
-            removed = (*removed, *(f"board.{key}" for key in sorted(stale) if not key.endswith("sigma_m")))
         original = read_profile(find_profile(origin))
-        text = derive_text(original, name, values, target, parent.name, removed)
+        text = derive_text(original, name, values, target, parent.name)
     if output == "-":
         click.echo(text, nl=False)
         return
@@ -230,10 +222,9 @@ def _sensor_settings(
     for name, text in zip(names, intrinsics, strict=True):
         values += lens_settings(name, parse_intrinsics(text))
     if board is not None:
-        plate = board_block(parse_board(board))
-        values += [(f"board.{key}", f"{value}") for key, value in plate.items()]
-        if "type" not in plate and parent.board.type != "checkerboard":
-            values.append(("board.type", "checkerboard"))
+        stated = parent.board.model_dump(exclude_none=True, exclude_unset=True)
+        deviations = {key: value for key, value in stated.items() if key.endswith("sigma_m")}
+        values.append(("board", as_yaml(board_block(parse_board(board)) | deviations)))
     return values
 
 

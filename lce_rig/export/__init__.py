@@ -11,13 +11,42 @@ import numpy as np
 
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.export.findings import MOUNT_UNUSED
 from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, choose_channels, require_known
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
+
+LENS_FITTED = Kind(
+    "export.lens_fitted",
+    "{format} has {n_coefficients} distortion coefficients: those of camera {subject} are fitted, "
+    "{rms_px:.3f} px rms, {max_px:.3f} px at most over the image",
+    severity="note",
+)
+NO_FRAME = Kind(
+    "export.no_frame",
+    "{format}: {file} is not written: it needs the frame {frame} (profile: mount), and the root is {root}",
+    "`lce-rig export {session} --formats {format} --tree URDF -o FOLDER`",
+    severity="warning",
+)
+NO_SESSION = Kind(
+    "export.no_session",
+    "{format} is not written: it needs the images and scans of a session",
+    "export from the session",
+    severity="warning",
+)
+NO_IMAGES = Kind(
+    "export.no_images",
+    "{format}: camera {subject} is left out: the session has no images of it",
+    severity="warning",
+)
+MOUNT_UNUSED = Kind(
+    "export.mount_unused",
+    "the profile's mount is not used: {source} has {frame} elsewhere, {angle_deg:deg} and "
+    "{distance_m:1mm} off",
+    severity="note",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +180,6 @@ EXPORTS: dict[str, Format] = {
         "ros_bag:export_mcap", "RIG_session/: the session for Foxglove and RViz, with projected clouds"
     ),
     "ply": Format("coloured_cloud:export_ply", "coloured_CAMERA.ply: coloured points of all captures"),
-    "ply_captures": Format(
-        "coloured_cloud:export_ply_captures", "coloured_CAMERA_CAPTURE.ply: of each capture"
-    ),
 }
 
 

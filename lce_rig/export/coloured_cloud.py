@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image, Scan
-from lce_rig.export import ExportJob
-from lce_rig.export.findings import NO_IMAGES, NO_SESSION
+from lce_rig.export import NO_IMAGES, NO_SESSION, ExportJob
 from lce_rig.scene.colouring import colour_points
 from lce_rig.session.durable import write_atomically
 
@@ -32,17 +31,8 @@ def export_ply(job: ExportJob) -> list[Path]:
     Raises:
         SessionError: a capture is damaged, or the disk is full.
     """
-    return _write(job, "ply", is_split=False)
-
-
-def export_ply_captures(job: ExportJob) -> list[Path]:
-    """Write coloured_CAMERA_CAPTURE.ply of each capture, for a rig that was moved; raises as `export_ply`."""
-    return _write(job, "ply_captures", is_split=True)
-
-
-def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
     if job.session is None:
-        job.findings.append(NO_SESSION(format=name))
+        job.findings.append(NO_SESSION(format="ply"))
         return []
     paths = []
     for calibration in job.of_cameras:
@@ -54,20 +44,18 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
                 image, scan = capture.image(calibration.camera, channels[0]), capture.scan(calibration.lidar)
                 clouds[capture.name] = coloured(image, scan, calibration, job, int(capture.name))
         if not clouds:
-            job.findings.append(NO_IMAGES(calibration.camera, format=name))
+            job.findings.append(NO_IMAGES(calibration.camera, format="ply"))
             continue
-        stem = f"coloured_{job.name_of(calibration)}"
-        parts = {f"{stem}_{capture}": cloud for capture, cloud in clouds.items()}
-        for file, points in parts.items() if is_split else [(stem, np.concatenate([*clouds.values()]))]:
-            path = job.folder / f"{file}.ply"
-            lines = job.head("coloured point cloud", calibration, of_one_camera=True)
-            lines.append(f"points in frame {job.rig.lidars[calibration.lidar].frame}, m")
-            lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in lines)]
-            lines.append(f"element vertex {len(points)}")
-            lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in _FIELDS]
-            head = "\n".join([*lines, "end_header"]) + "\n"
-            write_atomically(path, head.encode("ascii", "replace") + points.tobytes())
-            paths.append(path)
+        points = np.concatenate([*clouds.values()])
+        path = job.folder / f"coloured_{job.name_of(calibration)}.ply"
+        lines = job.head("coloured point cloud", calibration, of_one_camera=True)
+        lines.append(f"points in frame {job.rig.lidars[calibration.lidar].frame}, m")
+        lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in lines)]
+        lines.append(f"element vertex {len(points)}")
+        lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in _FIELDS]
+        head = "\n".join([*lines, "end_header"]) + "\n"
+        write_atomically(path, head.encode("ascii", "replace") + points.tobytes())
+        paths.append(path)
     return paths
 
 

@@ -27,8 +27,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.phrasing import significant
-from lce_rig.export import ExportJob
-from lce_rig.export.findings import LENS_FITTED, NO_FRAME
+from lce_rig.export import LENS_FITTED, NO_FRAME, ExportJob
 from lce_rig.export.robot_tree import FrameTree, RobotTree
 from lce_rig.export.writing import number, numbers, quaternion_wxyz, quoted, rows, rpy
 

@@ -16,8 +16,7 @@ import numpy as np
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.export import ExportJob
-from lce_rig.export.findings import NO_IMAGES, NO_SESSION
+from lce_rig.export import NO_IMAGES, NO_SESSION, ExportJob
 from lce_rig.export.ros_files import ros_distortion
 from lce_rig.export.writing import quaternion_wxyz
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan

@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import SessionError, SourceError, reading
 from lce_rig.core.geometry import pose
-from lce_rig.export import ExportJob
-from lce_rig.export.findings import NO_FRAME
+from lce_rig.export import NO_FRAME, ExportJob
 from lce_rig.export.robot_tree import FrameTree, Joint, JointChange, RobotTree, fit_tree
 from lce_rig.export.writing import RPY_BODY_OPTICAL, number, rpy
 from lce_rig.rig import Rig

@@ -68,8 +68,6 @@ PAIR: Mapping[str, tuple[Any, Select]] = {
     "mpe_m": (_FLOAT, lambda c, _: c.metrics.mpe_m),
     "mee_m": (_FLOAT, lambda c, _: c.metrics.mee_m),
     "reprojection_px": (_FLOAT, lambda c, _: c.metrics.reprojection_px),
-    "time_offset_s": (_FLOAT, lambda c, _: _mean_offset_s(c)),
-    "camera_scale": (_FLOAT, lambda c, _: c.diagnostics.camera_scale),
     "scene": (_TEXT, lambda c, _: None if c.scene is None else c.scene.state),
 }
 """Columns of a camera and a LiDAR: type, and the value in a result with the sensors' serial numbers."""
@@ -81,11 +79,6 @@ COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: v
 _ROWS_PER_GROUP = 1 << 16
 # Poses and covariances, most of the bytes, do not shrink: the fastest to read wins.
 _COMPRESSION = "lz4"
-
-
-def _mean_offset_s(c: Calibration) -> float:
-    offsets = [channel.time_offset_s for channel in c.channel_results if channel.time_offset_s is not None]
-    return float(np.mean(offsets)) if offsets else math.nan
 
 
 def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mapping[str, str]) -> list[Row]:

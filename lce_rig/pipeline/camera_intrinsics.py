@@ -24,7 +24,6 @@ from lce_rig.core.errors import (
     UsageError,
     refusal_of,
 )
-from lce_rig.core.files import read_json
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
@@ -279,8 +278,8 @@ FORMAT_VERSION = 1
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step.
 
-    For each camera a camera_info file and a page of plots; and intrinsics.json for machines. Other files
-    there stay, as those of cameras that an earlier run measured.
+    For each camera a camera_info file and a page of plots; and intrinsics.json of this run for machines.
+    Other files there stay, as those of cameras that an earlier run measured.
 
     Returns:
         The files of this run.
@@ -294,15 +293,11 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
     names = [DOCUMENT]
 
     def finish(earlier: Path, draft: Path) -> None:
-        content = document(session.rig, measured)
-        with suppress(OSError, ValueError, KeyError, TypeError):  # no entries of an earlier run, or damaged
-            others = read_json(earlier / DOCUMENT)["cameras"]
-            cameras = {one.camera for one in measured}
-            content["cameras"] += [other for other in others if other["camera"] not in cameras]
-        write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
         keep_foreign(earlier, draft, lambda path: path.name in names)
 
     with replacing(session.path, session.path / INTRINSICS, finish) as draft:
+        content = json.dumps(document(session.rig, measured), indent=2)
+        write_atomically(draft / DOCUMENT, content + "\n")
         for one in measured:
             info, page = f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
             head = _head(session.rig, one)
@@ -389,9 +384,11 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
     estimate, lens = measured.estimate, measured.intrinsics
     check, profile = measured.check, None
     if check is not None:
+        # A figure may not be finite, as when the profile's intrinsics project nothing.
+        figures = asdict(check).items()
         profile = {
             "intrinsics": lens_block(measured.given),
-            **{name: _figure(value) for name, value in asdict(check).items()},
+            **{name: v if v is not None and np.isfinite(v) else None for name, v in figures},
             "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),
         }
     return {
@@ -419,8 +416,3 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
         "views_refused": {name: why.as_json() for name, why in measured.refused.items()},
         "profile": profile,
     }
-
-
-def _figure(value: float | None) -> float | None:
-    """Return null for a figure that is not finite, as when the profile's intrinsics project nothing."""
-    return value if value is not None and np.isfinite(value) else None

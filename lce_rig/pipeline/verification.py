@@ -149,8 +149,14 @@ def verify(
             if pair in pairs:
                 seen = detections.between(pair)
                 check = check_session(session.rig, seen, c, channel, scene)
-                # A result of this session has been judged by these boards.
-                checks.append(check if c.captures_used else _with_boards(session.rig, seen, check))
+                if not c.captures_used:  # A result of this session has been judged by these boards.
+                    # The six axes together: residuals hide a rotation that a translation undoes.
+                    key = (pair.camera, pair.channel)
+                    alone = Detections({key: seen.images[key]}, {pair.lidar: seen.lidars[pair.lidar]})
+                    board = watch_boards(session.rig, c, channel, alone)
+                    if board is not None and board.joint.is_changed:
+                        check = replace(check, findings=(board.joint.finding, *check.findings))
+                checks.append(check)
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
@@ -194,16 +200,6 @@ def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, .
     if not changed:
         return rig, ()
     return rig.model_copy(update={"cameras": cameras}), (OTHER_PROFILE(keys=", ".join(changed)),)
-
-
-def _with_boards(rig: Rig, detections: Detections, check: SessionCheck) -> SessionCheck:
-    """Add what boards say of the six axes together: residuals hide a rotation that a translation undoes."""
-    pair, key = check.pair, (check.pair.camera, check.pair.channel)
-    alone = Detections({key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]})
-    board = watch_boards(rig, check.calibration, pair.channel, alone)
-    if board is None or not board.joint.is_changed:
-        return check
-    return replace(check, findings=(board.joint.finding, *check.findings))
 
 
 def _extrinsics(
@@ -271,7 +267,6 @@ def write_debug_images(
             lidar,
             board=session.rig.board.to_board(),
             intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
-            limits=session.rig.quality,
             title=f"{pair}  {name}",
             chosen=index,
             mismatch=mismatch if mismatch is not None and mismatch.stage == "pair" else None,

@@ -22,7 +22,6 @@ def derive_text(
     settings: Sequence[tuple[str, str]],
     source: str,
     origin: str,
-    removed: Sequence[str] = (),
 ) -> str:
     """Derive a profile's text from another's.
 
@@ -32,7 +31,6 @@ def derive_text(
         settings: (key path, YAML value) to set, such as ("board.square_m", "0.08").
         source: name of the new text in errors, usually its file.
         origin: name of the other profile.
-        removed: key paths to remove, such as "nominal_extrinsics".
 
     Returns:
         The new profile, which is valid.
@@ -44,15 +42,13 @@ def derive_text(
     head = f"# {name}: made from {origin} by `rigs new`; the comments below are from {origin}.\n"
     # The comments above the first key are about the other profile.
     text = head + set_value(text[_compose(text).start_mark.index :], "name", as_yaml(name))
-    if "description" not in [key for key, _ in settings]:
-        text = remove_key(text, "description", must_exist=False)
-    return edit_text(text, settings, removed, source)
+    if "description" in read_document(text, origin).data:
+        text = set_value(text, "description", "''")
+    return edit_text(text, settings, source)
 
 
-def edit_text(text: str, settings: Sequence[tuple[str, str]], removed: Sequence[str], source: str) -> str:
-    """Remove and set keys of a profile's text; arguments, result and errors as of `derive_text`."""
-    for path in removed:
-        text = remove_key(text, path)
+def edit_text(text: str, settings: Sequence[tuple[str, str]], source: str) -> str:
+    """Set keys of a profile's text; arguments, result and errors as of `derive_text`."""
     for path, value in settings:
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
@@ -118,39 +114,6 @@ def set_value(text: str, path: str, value: str) -> str:
     if data != wanted:
         raise UsageError(f"--set {path}: {value!r} is not allowed there", "quote a text that holds : or #")
     return new
-
-
-def remove_key(text: str, path: str, *, must_exist: bool = True) -> str:
-    """Remove one key with its value and the comments directly above it.
-
-    Args:
-        text: valid YAML.
-        path: keys and places in lists joined by dots: "nominal_extrinsics", "cameras.cam.driver".
-        must_exist: whether a key that is missing is an error.
-
-    Raises:
-        UsageError: there is no such key, or it stands in a block in braces.
-    """
-    *parents, last = path.split(".")
-    node, depth = _descend(_compose(text), parents)
-    pairs = node.value if depth == len(parents) and isinstance(node, yaml.MappingNode) else []
-    pair = next(((key, value) for key, value in pairs if key.value == last), None)
-    if pair is None:
-        if must_exist:
-            raise UsageError(f"--unset {path}: the profile has no such key")
-        return text
-    key, value = pair
-    if isinstance(node, yaml.MappingNode) and node.flow_style:
-        raise UsageError(f"--unset {path}: remove it with --set {'.'.join(parents)}=VALUE")
-    begin = text.rfind("\n", 0, key.start_mark.index) + 1
-    while begin > 0:
-        above = text.rfind("\n", 0, begin - 1) + 1
-        line = text[above : begin - 1]
-        if not (line.lstrip().startswith("#") and len(line) - len(line.lstrip()) == key.start_mark.column):
-            break
-        begin = above
-    end = text.find("\n", _end(value))
-    return text[:begin] + ("" if end < 0 else text[end + 1 :])
 
 
 def _load(text: str) -> object:

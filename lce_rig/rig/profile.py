@@ -10,16 +10,9 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.rig.board_settings import BoardSettings
-from lce_rig.rig.findings import (
-    DRIFTING_CLOCK,
-    ODD_RATE,
-    SHARED,
-    SWAPPED_SIDES,
-    UNKNOWN_MODEL,
-)
 from lce_rig.rig.sensors import (
     CameraSettings,
     ChannelSettings,
@@ -42,8 +35,26 @@ from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
-_USUAL_RATE_HZ = 4.0, 40.0
 
+SWAPPED_SIDES = Kind(
+    "profile.swapped_sides",
+    "{subject}: {n_cols}x{n_rows} corners run along the shorter side of the plate "
+    "{width_m:g} x {height_m:g} m",
+    "check whether to swap width_m and height_m, or the [columns, rows]",
+    severity="warning",
+)
+DRIFTING_CLOCK = Kind(
+    "profile.drifting_clock",
+    "{subject}: the sensor's own clock without sync drifts away from the others",
+    severity="warning",
+)
+UNKNOWN_MODEL = Kind(
+    "profile.unknown_model",
+    "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
+    "simulation need elevations_deg and columns",
+    "the model `other` measures them: `lce-rig rigs new --help`",
+    severity="warning",
+)
 
 BOARD, PPS_LINE = "sync", "pps"
 """Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
@@ -339,7 +350,6 @@ class Rig(Settings):
         cols, rows, width_m, height_m = board.cols, board.rows, board.width_m, board.height_m
         if (cols - rows) * (width_m - height_m) < 0:
             yield SWAPPED_SIDES("board", n_cols=cols, n_rows=rows, width_m=width_m, height_m=height_m)
-        # Streams have timestamps and a topic of their own, cameras a device.
         streams: dict[str, LidarSettings | ChannelSettings] = {
             f"lidars.{name}": lidar for name, lidar in self.lidars.items()
         }
@@ -348,18 +358,7 @@ class Rig(Settings):
         for key, stream in streams.items():
             if stream.timestamps.clock == "device" and stream.timestamps.sync == "none":
                 yield DRIFTING_CLOCK(f"{key}.timestamps")
-        # A copied block leaves settings that two sensors cannot share.
-        unshared = [(f"{key}.topic", "topic", stream.topic) for key, stream in streams.items()]
-        unshared += [
-            (f"cameras.{n}.driver.device", "device", c.driver.device) for n, c in self.cameras.items()
-        ]
-        first: dict[tuple[str, str], str] = {}
-        for key, kind, value in unshared:
-            if value is not None and first.setdefault((kind, value), key) != key:
-                yield SHARED(key, value=value, other=first[kind, value])
         for name, lidar in self.lidars.items():
-            if lidar.has_rings and not _USUAL_RATE_HZ[0] <= lidar.rate_hz <= _USUAL_RATE_HZ[1]:
-                yield ODD_RATE(f"lidars.{name}.rate_hz", rate_hz=lidar.rate_hz)
             if lidar.data_sheet() is None:
                 yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)
 

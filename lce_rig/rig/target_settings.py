@@ -23,7 +23,6 @@ OutputFormat = Literal[
     "isaac",
     "mcap",
     "ply",
-    "ply_captures",
 ]
 # Options that make ssh run a program on this computer are not among them.
 SshOption = Literal[

@@ -185,6 +185,7 @@ def workbench():
         calls("calibrate", session, "--robot", "kestrel")
         shutil.copytree(session, folder / "sessions" / "other")
         calls("simulate", "--rig", rig, folder / "other", "--captures", 10, "--seed", 4, "--mounting", 3)
+        calls("calibrate", folder / "other", "--no-report")
         wrong = folder / "wrong.yaml"
         # A focal length 3 % too long.
         wrong.write_text(re.sub(r"(f[xy]_px): [0-9.]+", r"\1: 924.0", rig.read_text()))

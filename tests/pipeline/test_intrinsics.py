@@ -134,14 +134,9 @@ def test_another_run_keeps_what_is_the_users_and_other_cameras(session, measured
     folder = session.path / "intrinsics"
     write_intrinsics(session, [measured])
     (folder / "notes.txt").write_text("mine")
-    document = json.loads((folder / "intrinsics.json").read_text())
-    document["cameras"][0]["camera"] = "left"
-    (folder / "intrinsics.json").write_text(json.dumps(document))
-    (folder / "left.yaml").write_text("left: block")
+    (folder / "camera_info_left.yaml").write_text("left")
     write_intrinsics(session, [measured])
-    cameras = json.loads((folder / "intrinsics.json").read_text())["cameras"]
-    assert [each["camera"] for each in cameras] == ["davis", "left"]
-    assert (folder / "left.yaml").read_text() == "left: block"
+    assert (folder / "camera_info_left.yaml").read_text() == "left"
     assert (folder / "notes.txt").read_text() == "mine"
 
 

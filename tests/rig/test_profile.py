@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
-from lce_rig.rig import CalibrationSettings, QualitySettings, Rig, dump_rig, find_profile, load_rig, parse_rig
+from lce_rig.rig import CalibrationSettings, QualitySettings, dump_rig, find_profile, load_rig, parse_rig
 from lce_rig.rig.loading import Document, all_keys, rig_from_document
 from lce_rig.rig.sensors import LidarSettings
 
@@ -176,19 +176,6 @@ def test_documented_defaults_are_those_of_the_code():
         for key, field in model.model_fields.items():
             if isinstance(field.default, int | float):
                 assert float(documented[key]) == field.default, key
-
-
-def test_what_a_copied_camera_shares_with_the_first_is_a_warning():
-    document = load_rig("rlfs").model_dump(exclude_none=True)
-    right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
-    document["cameras"]["right"] = right
-    topic, device = Rig.model_validate(document).warnings()
-    for warning, key, value in (
-        (topic, "channels.frames.topic", "/camera/image_raw"),
-        (device, "driver.device", "/dev/video0"),
-    ):
-        assert (warning.code, warning.subject) == ("profile.shared", f"cameras.right.{key}")
-        assert warning.figures == {"value": value, "other": f"cameras.cam.{key}"}
 
 
 def test_a_driver_or_model_that_nothing_knows_is_named_with_its_key():

@@ -16,8 +16,6 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.image.corners import find_grid, seen_grid
 from lce_rig.detect.image.markers import marker_corners
-from lce_rig.detect.lidar.search import plane_limit_m
-from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, BLUE, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
 from lce_rig.show.overlays.overlay import draw_image_board, range_limits
@@ -32,30 +30,6 @@ _DIM = 0.45
 _DPI, _WIDTH_IN, _PANE_IN, _REPORT_IN = 100, 16, 5.9, 1.9
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"
-# Figures beside an image, in this order, with their formats.
-_IMAGE_FIGURES = {
-    "distance_m": "distance {:.2f} m",
-    "tilt_deg": "tilt {:.0f} deg",
-    "corner_rms_px": "corners {:.2f} px rms",
-    "square_px": "squares {:.0f} px",
-    "sharpness": "sharpness {:.1f}",
-    "contrast": "contrast {:.0f}",
-    "border_px": "{:.0f} px to the border",
-    "events_px_s": "{:.1f} events/px/s",
-    "events_px": "{:.1f} events/px in 1 s",
-    "speed_mps": "speed {:.2f} m/s",
-    "turn_deg_s": "turns {:.0f} deg/s",
-    "smear_m": "swept over {:.1f} mm",
-}
-_LIDAR_FIGURES = {
-    "distance_m": "distance {:.2f} m",
-    "n_rings": "{:.0f} rings",
-    "n_points": "{:.0f} points",
-    "plane_rms_m": "plane {:.1f} mm rms",
-    "width_m": "width {:.0f} mm",
-    "height_m": "height {:.0f} mm",
-    "edge_rms_m": "edges {:.1f} mm rms",
-}
 
 
 def draw_debug(
@@ -66,13 +40,12 @@ def draw_debug(
     *,
     board: Board,
     intrinsics: Intrinsics,
-    limits: QualitySettings,
     title: str,
     chosen: int = 0,
     mismatch: Refusal | None = None,
     events: Events | None = None,
 ) -> Picture:
-    """Draw the camera's image beside three views of the scan, with figures or cause and action below.
+    """Draw the camera's image beside three views of the scan, with cause and action where one is refused.
 
     Args:
         image: None if it could not be read.
@@ -81,7 +54,6 @@ def draw_debug(
         lidar_result: candidates, best first, or why the scan was refused.
         board: the board.
         intrinsics: the camera.
-        limits: of the profile.
         title: one line above.
         chosen: index of the candidate used, which is drawn face on.
         mismatch: why no candidate is the board in the image, if the sensors disagree; the best one is drawn
@@ -118,24 +90,8 @@ def draw_debug(
             if events is not None:
                 _show(panes["events"], _event_picture(image, events, image_result, board, intrinsics))
         _draw_scan(panes, scan, lidar_result, board, chosen, mismatch)
-        if isinstance(image_result, Refusal):
-            _write_refusal(panes["seen"], "camera: refused", image_result)
-        else:
-            notes = ["pose ambiguous from the image alone"] if image_result.is_ambiguous else []
-            figures = image_result.figures()
-            _write_figures(panes["seen"], "camera: board found", figures, _IMAGE_FIGURES, notes)
-        if isinstance(lidar_result, Refusal) or mismatch is not None:
-            refused = lidar_result if isinstance(lidar_result, Refusal) else mismatch
-            assert refused is not None
-            heading = "LiDAR: refused" if refused is lidar_result else "LiDAR: no candidate is the board"
-            _write_refusal(panes["scan"], heading, refused)
-        else:
-            rivals = len(lidar_result) - 1
-            notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of its size"] if rivals else []
-            figures = lidar_result[chosen].figures()
-            limit_m = plane_limit_m(limits.max_thickness_m, figures["range_noise_m"])
-            notes.append(f"plane limit {1000 * limit_m:.1f} mm")
-            _write_figures(panes["scan"], "LiDAR: board found", figures, _LIDAR_FIGURES, notes)
+        _write(panes["seen"], "camera", image_result if isinstance(image_result, Refusal) else None)
+        _write(panes["scan"], "LiDAR", lidar_result if isinstance(lidar_result, Refusal) else mismatch)
         drawn.draw()
     return np.ascontiguousarray(np.asarray(drawn.buffer_rgba())[..., 2::-1])
 
@@ -262,8 +218,12 @@ def _draw_scan(
         above.plot(outline[:, 1], outline[:, 0], color=tone)
         above.text(middle[1] - 0.04 * reach_m, middle[0], number, color=tone)
     above.plot(0, 0, "wo")
-    low, high = _reach(_angles_deg(points)[1])
-    unrolled.set(xlim=(180, -180), ylim=(low, high), xticks=range(-135, 136, 45), yticks=[])
+    elevation_deg = _angles_deg(points)[1] if len(points) else np.array([-15.0, 15.0])
+    low, high = float(elevation_deg.min()), float(elevation_deg.max())
+    # Room for azimuths below and a candidate's number above.
+    margin = 0.1 * max(high - low, 10.0)
+    limits = low - 2.5 * margin, high + 1.5 * margin
+    unrolled.set(xlim=(180, -180), ylim=limits, xticks=range(-135, 136, 45), yticks=[])
     above.set(xlim=(reach_m, -reach_m), ylim=(-reach_m, reach_m), aspect="equal", xticks=[])
     # Labels at the ends would be cut by the frame.
     above.set_yticks([y for y in above.get_yticks() if abs(y) < 0.95 * reach_m])
@@ -299,27 +259,10 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
     return np.degrees(np.arctan2(points[:, 1], points[:, 0])), np.degrees(np.arctan2(points[:, 2], level))
 
 
-def _reach(elevation_deg: Array) -> tuple[float, float]:
-    """Choose the elevations to show, with room for azimuths below and a candidate's number above."""
-    low, high = (elevation_deg.min(), elevation_deg.max()) if len(elevation_deg) else (-15.0, 15.0)
-    margin = 0.1 * max(high - low, 10.0)
-    return low - 2.5 * margin, high + 1.5 * margin
-
-
-def _write_refusal(pane: Any, heading: str, refusal: Refusal) -> None:
-    words = "\n".join(fill(text, 90) for text in (refusal.text, refusal.advice))
-    pane.text(0.02, 0.95, heading, color=_REFUSED, fontsize=13, va="top")
-    pane.text(0.02, 0.75, words, fontsize=11, va="top")
-
-
-def _write_figures(
-    pane: Any, heading: str, figures: Mapping[str, float], wanted: Mapping[str, str], notes: Sequence[str]
-) -> None:
-    pane.text(0.02, 0.95, heading, color=_FOUND, fontsize=13, va="top")
-    lines = [
-        text.format(figures[name] * (1000 if " mm" in text else 1))
-        for name, text in wanted.items()
-        if name in figures
-    ]
-    for k, line in enumerate([*lines, *notes]):
-        pane.text(0.02 + 0.33 * (k % 3), 0.75 - 0.15 * (k // 3), line, fontsize=11, va="top")
+def _write(pane: Any, sensor: str, refusal: Refusal | None) -> None:
+    """State that a sensor found the board, or why not and what to do."""
+    state, colour = ("board found", _FOUND) if refusal is None else ("refused", _REFUSED)
+    pane.text(0.02, 0.95, f"{sensor}: {state}", color=colour, fontsize=13, va="top")
+    if refusal is not None:
+        words = "\n".join(fill(text, 90) for text in (refusal.text, refusal.advice))
+        pane.text(0.02, 0.75, words, fontsize=11, va="top")

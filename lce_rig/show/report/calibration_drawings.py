@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,6 @@ from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
-from lce_rig.judge.findings import cause_words
-from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.show.overlays.intrinsics_plot import add_mean_arrows
 from lce_rig.show.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
 
@@ -76,11 +73,6 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
 
 
 _LINE = 0.8
-# Names along an axis.
-_MOST_LABELS = 10
-_DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
-# Causes of less than this, in percent, are in the table only.
-_LEAST_SHARE = 0.5
 
 
 def _image_axes(lens: Intrinsics) -> tuple[Any, Any]:
@@ -146,30 +138,6 @@ def _add_shapes(axes: Any, shapes: Sequence[Array], links: list[str], alpha: flo
     axes.add_collection(drawn, autolim=False)
 
 
-def draw_by_capture(calibration: Calibration, links: Mapping[str, str]) -> Markup:
-    """Draw two bars for each capture, planes and edges, which lead to its overlay."""
-    residuals = calibration.residuals
-    at = np.arange(len(residuals))
-    figure, (axes,) = new_axes(2.4)
-    for shift, colour, name, values in (
-        (-0.2, BLUE, "planes", [r.plane_mean_m for r in residuals]),
-        (0.2, ORANGE, "edges", [r.edge_mean_m for r in residuals]),
-    ):
-        bars = axes.bar(at + shift, 1000 * np.nan_to_num(values), 0.4, color=colour, label=name)
-        for bar, residual in zip(bars, residuals, strict=True):
-            bar.set_url(links[residual.capture])
-    every = -(-len(residuals) // _MOST_LABELS)
-    names = [r.capture.rpartition("/")[2].lstrip("0") or "0" for r in residuals]
-    axes.set_xticks(at[::every], names[::every])
-    axes.set_xlabel("capture")
-    axes.set_title("mean distance, mm")
-    axes.grid(axis="y")
-    axes.set_axisbelow(True)
-    axes.margins(x=0.01)
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0, handlelength=1.2)
-    return drawing(figure, "Residuals by capture")
-
-
 def draw_by_ring(evidence: Evidence) -> Markup:
     """Draw how far each laser ring's points lie behind the camera's board planes on average."""
     rings = np.unique(evidence.ring)
@@ -226,52 +194,3 @@ def principal_axes(cov: Array) -> tuple[Array, Array]:
     largest = np.abs(directions).argmax(axis=0)
     directions = directions * np.sign(directions[largest, range(3)])
     return np.sqrt(np.maximum(variances[order], 0)), directions
-
-
-def draw_by_distance(calibration: Calibration, lens: Intrinsics) -> Markup:
-    """Draw the expected error of a LiDAR point in pixels and in centimetres by its distance."""
-    cov, cross = calibration.cov, calibration.intrinsics_cross_cov
-    if cross is not None and calibration.intrinsics_cov is not None:
-        cov = with_lens(cov, cross, calibration.intrinsics_cov)
-    points = point_uncertainties(calibration.T_cam_lidar, cov, lens, _DISTANCES_M)
-    figure, (left, right) = new_axes(2.1, 2)
-    _draw_reach(left, [p.centre_px for p in points], [p.corner_px for p in points], "error in the image, px")
-    _draw_reach(
-        right, [100 * p.centre_m for p in points], [100 * p.corner_m for p in points], "error in space, cm"
-    )
-    left.legend(loc="best", handlelength=1.2)
-    return drawing(figure, "Error of a LiDAR point by its distance")
-
-
-def _draw_reach(axes: Any, centre: Sequence[float], corner: Sequence[float], title: str) -> None:
-    axes.plot(_DISTANCES_M, centre, color=BLUE, label="in the middle")
-    axes.plot(_DISTANCES_M, corner, color=ORANGE, label="in the worst corner")
-    axes.set_xlabel("distance, m")
-    axes.set_title(title)
-    axes.set_xlim(0, _DISTANCES_M[-1])
-    axes.set_ylim(0, 1.1 * max(*centre, *corner))
-    axes.grid()
-
-
-def draw_causes(calibration: Calibration) -> Markup:
-    """Draw each cause's share of the variance, in rotation and in translation."""
-    causes = calibration.contributions
-    squares = np.array([[c.sigma_rotation_deg, c.sigma_translation_m] for c in causes]) ** 2
-    shares = 100 * squares / np.maximum(squares.sum(axis=0), 1e-30)
-    is_shown = shares.max(axis=1) >= _LEAST_SHARE
-    shares = shares[is_shown]
-    names = [
-        cause_words(c.source).removeprefix("the ") for c, shown in zip(causes, is_shown, strict=True) if shown
-    ]
-    at = np.arange(len(names))
-    figure, (axes,) = new_axes(0.75 + 0.42 * len(names), left_in=2.0)
-    axes.barh(at - 0.2, shares[:, 0], 0.38, color=BLUE, label="rotation")
-    axes.barh(at + 0.2, shares[:, 1], 0.38, color=ORANGE, label="translation")
-    axes.set_yticks(at, [fill(name, 28) for name in names], color=INK)
-    axes.tick_params(axis="y", length=0)
-    axes.invert_yaxis()
-    axes.set_xlabel("share of the variance, %")
-    axes.grid(axis="x")
-    axes.set_axisbelow(True)
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0, handlelength=1.2)
-    return drawing(figure, "Causes of the uncertainty")

@@ -181,22 +181,17 @@ def _gallery(
 def _drawings(
     c: Calibration, board: Board, lens: Intrinsics | None, evidence: Evidence | None, anchor: str
 ) -> dict[str, Markup]:
-    """Draw a result; without its boards its uncertainty alone."""
-    drawn = {} if lens is None else {"by_distance": drawings.draw_by_distance(c, lens)}
-    if c.contributions:
-        drawn["causes"] = drawings.draw_causes(c)
+    """Draw a result; nothing without its boards."""
+    if evidence is None or lens is None:
+        return {}
     links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
-    if links:
-        drawn["by_capture"] = drawings.draw_by_capture(c, links)
-    if evidence is not None and lens is not None:
-        drawn |= {
-            "in_image": drawings.draw_in_image(evidence, board, lens, links),
-            "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-            "by_ring": drawings.draw_by_ring(evidence),
-            "by_range": drawings.draw_by_range(evidence, links),
-            "corners": drawings.draw_corners(evidence, lens),
-        }
-    return drawn
+    return {
+        "in_image": drawings.draw_in_image(evidence, board, lens, links),
+        "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
+        "by_ring": drawings.draw_by_ring(evidence),
+        "by_range": drawings.draw_by_range(evidence, links),
+        "corners": drawings.draw_corners(evidence, lens),
+    }
 
 
 def _statement(c: Calibration) -> str:
@@ -253,7 +248,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
         if c.is_of_lidars
         else f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
         "ring ends must lie on the board's outline on all sides.",
-        "Collect a second session on another day and compare both: "
+        "Collect a second session on another day, calibrate it and compare both: "
         f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
         *optional,
     ]

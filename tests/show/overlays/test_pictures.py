@@ -11,7 +11,6 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.findings import IMAGE_TILTED
-from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, write_picture
 from lce_rig.show.overlays.debug_image import draw_debug
 from lce_rig.show.overlays.overlay import draw_overlay
@@ -122,7 +121,6 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image, has_lidar):
         [lidar_board(points), lidar_board(points - [0, 0.2, 0])] if has_lidar else refusal,
         board=BOARD,
         intrinsics=FOLDING,
-        limits=QualitySettings(),
         title="capture 000000",
     )
     assert drawn.shape[1] == 1600

@@ -14,7 +14,7 @@ from tests.export.conftest import calibration as without_boards
 
 from .conftest import RLFS
 
-_DRAWINGS = 8
+_DRAWINGS = 5
 
 
 @pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
@@ -31,10 +31,10 @@ def test_it_is_small_requests_nothing_and_every_link_leads_to_one_place(which, r
     assert set(re.findall(r'href="#([^"]+)"', text) + re.findall(r"url\(#([^)]+)\)", text)) <= set(ids)
 
 
-def test_every_capture_s_bars_lead_to_its_overlay(one, one_page):
+def test_every_capture_s_marks_lead_to_its_overlay(one, one_page):
     for k, residual in enumerate(one.residuals):
-        # Planes, edges, outline, plate from above, residual by range, picture; and the table.
-        assert one_page.count(f'href="#pair-0-capture-{k}"') == 7
+        # Outline, plate from above, residual by range, picture; and the table.
+        assert one_page.count(f'href="#pair-0-capture-{k}"') == 5
         assert f'src="overlays/{residual.capture}.png"' in one_page
 
 
@@ -74,7 +74,7 @@ def test_the_earlier_result_is_named_only_where_there_is_one(one, page, has_prev
 
 def test_a_result_that_was_read_from_a_file_lacks_only_its_boards(page):
     text = page(load_rig("rles"), without_boards())
-    assert text.count("<svg ") == 1
+    assert "<svg " not in text
     assert "näher – ¼ m" in text
 
 

@@ -29,7 +29,7 @@ def test_pictures_of_captures_are_part_of_the_page(browser, one, one_page, tmp_p
     assert page.complaints == []
 
 
-def test_a_bar_opens_the_capture_s_overlay(browser, one_page, tmp_path):
+def test_a_mark_opens_the_capture_s_overlay(browser, one_page, tmp_path):
     (tmp_path / "report.html").write_text(one_page, encoding="utf-8")
     (tmp_path / "overlays").mkdir()
     cv2.imwrite(str(tmp_path / "overlays" / "000001.png"), np.full((1200, 1000, 3), 90, np.uint8))
@@ -38,7 +38,7 @@ def test_a_bar_opens_the_capture_s_overlay(browser, one_page, tmp_path):
     shown = f"{overlays}.filter((each) => each.offsetHeight).map((each) => each.id)"
     assert page.evaluate(shown) == []
     page.evaluate(
-        """document.querySelector('svg[aria-label="Residuals by capture"] a[*|href="#pair-0-capture-1"]')
+        """document.querySelector('svg[aria-label="Residuals by range"] a[*|href="#pair-0-capture-1"]')
         .dispatchEvent(new MouseEvent('click', {bubbles: true}))"""
     )
     page.wait_until(f"{shown}.length === 1")
