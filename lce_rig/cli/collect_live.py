@@ -55,11 +55,6 @@ def run_live(
     """Collect live into a session and report the outcome; the options are those of --help."""
     if seed is not None and not simulated:
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
-    if not rig.cameras:
-        raise UsageError(
-            f"rig {rig.name!r} has no cameras: live collection needs one that sees the board",
-            "Record all LiDARs at once and give the recording: --from FILE or FOLDER.",
-        )
     require_kind(path, (seed or 0) if simulated else None)
     with ExitStack() as stack:
         # The page first: an address that cannot be served fails before anything is created or started.
@@ -176,6 +171,8 @@ def _tell(
     if lost:
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     ending = _ENDINGS[report.ending]
+    if report.ending == "enough" and not report.predicted:
+        ending = "enough placements"
     if report.ending == "exhausted" and n_wanted is not None:
         ending += f"; {n_captures} of {n_wanted} captures"
     show.note(f"ended: {ending}")

@@ -17,6 +17,11 @@ GUIDE_NO_NOMINAL = Kind(
     "the profile has no nominal extrinsics of {camera} and {lidar}",
     severity="warning",
 )
+GUIDE_WITHOUT_CAMERA = Kind(
+    "guide.without_camera",
+    "no guidance without a camera: {n_captures} placements that differ in distance, side and tilt are enough",
+    severity="note",
+)
 GUIDE_CONTINUES = Kind(
     "guide.continues",
     "captures to go: {n_more} (minimum {n_least}, below {limit_deg:g} deg, {limit_mm:g} mm)",

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ import pytest
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import truth_extrinsics
+
+TWO_LIDARS = str(Path(__file__).parents[1] / "rigs" / "two_lidars.yaml")
 
 
 @pytest.mark.parametrize(
@@ -75,8 +78,12 @@ def start(path, *arguments, rig="rles", **options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("rig", "camera"), [("rles", "davis"), ("mid360", "cam")])
-def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path, rig, camera):
+@pytest.mark.parametrize(
+    ("rig", "pair"),
+    [("rles", ("davis", "lidar")), ("mid360", ("cam", "lidar")), (TWO_LIDARS, ("front", "side"))],
+    ids=["rles", "mid360", "two lidars"],
+)
+def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path, rig, pair):
     path = tmp_path / "session"
     process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3", rig=rig)
     _, said = process.communicate(timeout=300)
@@ -85,8 +92,9 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path
     assert len(session.captures) == 2
     for capture in session.captures:
         capture.check()
+        assert len(capture.lidars) + len(capture.image_keys) >= 2
     truth = json.loads((path / "truth.json").read_text())
-    expected = truth_extrinsics(load_rig(rig), 0)[camera, "lidar"]
+    expected = truth_extrinsics(load_rig(rig), 0)[pair]
     assert np.allclose(truth["T_cam_lidar"], expected)
     assert "2 captures (2 new)" in said and "holding:" in said
 

@@ -63,7 +63,9 @@ class Learning:
         self._calibrate_again(self._shown.pop(name))
 
     def _calibrate_again(self, detection: BoardDetection) -> None:
-        self._due += [k for k, g in enumerate(self._guides) if g.sees(detection) and k not in self._due]
+        for k, guide in enumerate(self._guides):
+            if guide.has_camera and guide.sees(detection) and k not in self._due:
+                self._due.append(k)
 
     def teach(self) -> None:
         """Pass what was learned since the last call to its guide, and begin to learn what came since."""

@@ -227,7 +227,7 @@ class _Loop:
         n_wanted = self._options.n_wanted
         if n_wanted is not None and self._n_before + len(self._asked) >= n_wanted:
             return narration  # A slow disk still writes the last ones.
-        present = detection.images[guide.key].T_cam_board
+        present = detection.poses[guide.key]
         refusal = guide.adds_nothing(present)
         if refusal is None:
             confirmed = self._search.confirm(moment)
@@ -263,7 +263,7 @@ class _Loop:
         self._captured_s = time.monotonic()
         for guide in self._guides:
             if guide.sees(detection):
-                guide.add(name, detection.images[guide.key].T_cam_board)
+                guide.add(name, detection.poses[guide.key])
 
     @property
     def _n_captures(self) -> int:
@@ -354,11 +354,11 @@ class _Loop:
         )
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
-        """Pick the guide to show: among cameras that see the board, the one with fewest captures.
+        """Pick the guide to show: among those that see the board, the one with fewest captures.
 
         Where they all have enough, the board goes before a camera whose guide has not.
         """
-        seeing = [g for g in self._guides if g.key in detection.images]
+        seeing = [g for g in self._guides if g.key in detection.poses]
         if seeing and all(guide.is_enough for guide in seeing):
             seeing += [guide for guide in self._guides if not guide.is_enough]
             return min(seeing, key=lambda guide: (guide.is_enough, guide.n_held))

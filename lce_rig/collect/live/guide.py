@@ -1,4 +1,4 @@
-"""The captures of one camera and one LiDAR, the next placement, and when a live board is captured."""
+"""The captures of a camera and a LiDAR or of two LiDARs, the next placement, and when a board is captured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,17 +7,19 @@ import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.findings import (
+    CALIBRATE_SAME_PLACEMENT,
     GUIDE_CONTINUES,
     GUIDE_NO_BEAMS,
     GUIDE_NO_NOMINAL,
     GUIDE_PREDICTED,
+    GUIDE_WITHOUT_CAMERA,
 )
 from lce_rig.collect.gates import BEST_SPEED_MPS, MotionGate, StillnessGate, stillness_window_s
 from lce_rig.collect.guidance.instructions import Kind, instruct, is_there, say
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE, Coverage, Guidance, Planner, measure_coverage
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.collect.live.state import Phase
-from lce_rig.collect.placement_dedupe import Placements, capture_poses
+from lce_rig.collect.placement_dedupe import MIN_MOVE_M, MIN_TURN_DEG, Placements, capture_poses, find_alike
 from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.findings import Finding, Losses, Refusal
 from lce_rig.core.geometry import Array
@@ -27,17 +29,21 @@ from lce_rig.session import Capture, Session
 
 #: Another placement is proposed after a board was wanted at one for so long.
 GIVE_UP_S = 30.0
+# Two LiDARs are then known to each other within 0.04 deg and 2 mm in simulations.
+_ENOUGH_OF_LIDARS = 12
 
 
 class Guide:
     """Guides the board before one camera and one LiDAR.
 
     Without a nominal extrinsic in the profile it begins when a first calibration is there; for a LiDAR whose
-    beams are not known there is no guidance at all.
+    beams are not known there is no guidance at all. Nor is there for two LiDARs without a camera, whose
+    captures are counted.
 
     Attributes:
-        key: camera and channel in which the board is followed.
+        key: camera and channel in which the board is followed; the first of two LiDARs, and "".
         lidar: name of the LiDAR.
+        has_camera: whether it is not of two LiDARs.
         problem: why there is no guidance yet; None while there is.
         guidance: the latest; None before the first.
     """
@@ -46,6 +52,7 @@ class Guide:
         """Begin without captures."""
         self.key = key
         self.lidar = lidar
+        self.has_camera = key[0] in rig.cameras
         self.problem: Finding | None = None
         self.guidance: Guidance | None = None
         self._min_captures = rig.quality.min_captures
@@ -57,12 +64,18 @@ class Guide:
         self._wanted_since_s = 0.0
         self._coverage: Coverage | None = None
         self._planner: Planner | None = None
+        self._at_first: tuple[Planner | None, Finding | None]
         self._model: SensorModel | None = None
+        self._n_enough = max(_ENOUGH_OF_LIDARS, rig.quality.min_captures)
+        if not self.has_camera:
+            self.problem = GUIDE_WITHOUT_CAMERA(n_captures=self._n_enough)
+            self._at_first = None, self.problem
+            return
         try:
             self._model = SensorModel.of(rig, key[0], lidar)
         except ProfileError as error:
             self.problem = GUIDE_NO_BEAMS(lidar, cause=error.what)
-            self._at_first: tuple[Planner | None, Finding | None] = None, self.problem
+            self._at_first = None, self.problem
             return
         nominal = rig.nominal(key[0], lidar)
         if nominal is None:
@@ -78,7 +91,9 @@ class Guide:
 
     @property
     def is_enough(self) -> bool:
-        """Whether the target is predicted to be met."""
+        """Whether the target is predicted to be met, or two LiDARs have captures enough."""
+        if not self.has_camera:
+            return self.n_held >= self._n_enough
         return self.guidance is not None and self.guidance.is_enough
 
     @property
@@ -103,6 +118,8 @@ class Guide:
 
     def sees(self, detection: BoardDetection) -> bool:
         """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
+        if not self.has_camera:
+            return {self.key[0], self.lidar} <= detection.lidars.keys()
         return self.key in detection.images.keys() - detection.unfit.keys() and self.lidar in detection.lidars
 
     def add(self, name: str, T_cam_board: Array) -> None:
@@ -176,6 +193,9 @@ class Guide:
 
     def adds_nothing(self, present: Array) -> Refusal | None:
         """Say why a board (4, 4) need not be captured where it is; None where it adds something."""
+        if not self.has_camera:
+            is_alike = find_alike(self._held_poses(), present[None], MIN_MOVE_M, np.radians(MIN_TURN_DEG))
+            return CALIBRATE_SAME_PLACEMENT.refusal() if is_alike.any() else None
         if self._planner is None:
             return None
         held, avoid = self._held_poses(), self._avoided()
@@ -266,7 +286,13 @@ def predict(session: Session) -> list[Finding]:
 
 
 def make_guides(rig: Rig) -> list[Guide]:
-    """Make a guide for every camera with every LiDAR: by its frames where it has any."""
+    """Make a guide for every camera with every LiDAR: by its frames where it has any.
+
+    Without cameras, make one for the first LiDAR with each other.
+    """
+    if not rig.cameras:
+        first, *others = rig.lidars
+        return [Guide(rig, (first, ""), lidar) for lidar in others]
     keys: list[ImageKey] = [
         (name, camera.first_channel("frames") or next(iter(camera.channels)))
         for name, camera in rig.cameras.items()
@@ -297,11 +323,14 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
     """Say what keeps a board out of sight.
 
     Args:
-        detection: in which the guide's camera or LiDAR does not see the board, or not well enough.
+        detection: in which a sensor of the guide does not see the board, or not well enough.
         guide: whose sensors they are.
         reasons: the last refusal of each stream, by its name.
     """
-    if guide.key not in detection.images:
+    lidar = guide.lidar
+    if not guide.has_camera and guide.key[0] not in detection.lidars:
+        lidar = guide.key[0]
+    if guide.has_camera and guide.key not in detection.images:
         why = reasons.get(".".join(guide.key))
         # An image without a board hardly tells why; one with half a board does.
         headline = f"show the board to {guide.key[0]}" if detection.images else _SHOW
@@ -310,9 +339,9 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
         why = detection.unfit[guide.key]
         headline = _next(guide, detection.images[guide.key].T_cam_board, why.advice)
         return Narration("moving", headline, f"cannot be used here: {why.text}")
-    why = reasons.get(guide.lidar)
-    headline = why.advice if why else "the LiDAR does not see the board"
-    return Narration("searching", headline, f"{guide.lidar}: {why.text}" if why else "")
+    why = reasons.get(lidar)
+    headline = why.advice if why else f"show the board to {lidar}"
+    return Narration("searching", headline, f"{lidar}: {why.text}" if why else "")
 
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:

@@ -18,7 +18,7 @@ _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
 _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
-_MET = "the target is predicted to be met"
+_MET, _COUNTED = "the target is predicted to be met", "enough placements"
 _WAIT = "waiting for the sensors"
 # Without a frame for so long, the last detection is out of date.
 _STALE_S = 2.0
@@ -51,6 +51,7 @@ class Monitor:
         self._ticks_left: int | None = None
         self._lost: frozenset[str] = frozenset()
         self._was_enough = False
+        self._met = _MET if session.rig.cameras else _COUNTED
 
     def see(self, detection: BoardDetection) -> None:
         """Take a detection, and remember why streams do not show the board."""
@@ -119,7 +120,7 @@ class Monitor:
         if is_enough and not self._was_enough:
             n_wanted = self._options.n_wanted
             what_now = "you may stop" if n_wanted is None else f"going on to {n_wanted} captures"
-            self.cue("enough", f"{_MET}: {what_now}")
+            self.cue("enough", f"{self._met}: {what_now}")
             self._was_enough = True
         phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
         rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
@@ -154,7 +155,7 @@ class Monitor:
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:
         said = self._narration
         if has_ended:
-            return "ended", "collection has ended", _MET if is_enough else ""
+            return "ended", "collection has ended", self._met if is_enough else ""
         if self._lost:
             name = sorted(self._lost)[0]
             error = self._sensors.lost().get(name)
@@ -163,8 +164,9 @@ class Monitor:
             return "enough", _ENOUGH, said.headline
         if self._is_stale():
             waited_s = time.monotonic() - self._seen_s
-            return "searching", _WAIT, f"no image with a scan of its time for {waited_s:.0f} s"
-        return said.phase, said.headline, said.detail or (_MET if is_enough else "")
+            pair = "image with a scan of its time" if self._session.rig.cameras else "scans of one time"
+            return "searching", _WAIT, f"no {pair} for {waited_s:.0f} s"
+        return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 
     def _watch_sensors(self) -> None:
         """Ask how sensors do, and log those that go and come back."""
@@ -202,7 +204,7 @@ class Monitor:
                 streams.append(self._stream(f"{name}.{channel}", status, rate_hz, figures))
         for name in rig.lidars:
             status, figures = self._statuses.get(name, SourceStatus(name)), None
-            if detection is not None and detection.images:
+            if detection is not None and detection.poses:
                 boards = detection.lidars.get(name)
                 figures = (
                     f"{boards[0].quality.n_rings} rings, {len(boards[0].points)} points" if boards else ""

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
 
@@ -100,10 +101,10 @@ class SimulatedRig:
             seed: of truth, room, noise and the person.
 
         Raises:
-            ProfileError: the rig has no camera with frames, or its LiDAR is not known.
+            ProfileError: no camera of the rig has frames, or its LiDAR is not known.
         """
         framed = [name for name, camera in rig.cameras.items() if camera.first_channel("frames")]
-        if not framed:
+        if rig.cameras and not framed:
             raise ProfileError(
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
                 "Simulate a recording instead: lce-rig simulate --recording FOLDER.",
@@ -116,7 +117,8 @@ class SimulatedRig:
         self._worker = Worker("simulated rig", _Simulation, rig, seed, views)
         self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
         self._now_s, self._period_s = 0.0, 1 / min(lidar.rate_hz for lidar in rig.lidars.values())
-        self._asked: tuple[str, Array] | None = None
+        self._is_guided = bool(framed)
+        self._asked: tuple[str, Array] | Literal["elsewhere"] | None = None
         self._asked_s = -1e9
         self._last: tuple[int, bytes] | None = None
         self._changed_s = 0.0
@@ -143,17 +145,19 @@ class SimulatedRig:
 
     def watch(self, state: LiveState) -> None:
         """Let the person see a state of the collection: where the board is wanted, and what was captured."""
-        drawing = state.drawing
-        if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving"):
+        place = state.drawing.wanted if state.drawing is not None else None
+        if state.phase in ("holding", "saving") or (self._is_guided and place is None):
             return
-        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self._now_s
+        wanted, now_s = (state.n_captures, b"" if place is None else place.tobytes()), self._now_s
         if wanted != self._last:
             self._last, self._changed_s = wanted, now_s
             self._asked_s = -1e9
         is_noticed = now_s - self._changed_s > REACTION_S
         if is_noticed and now_s - self._asked_s > AGAIN_S:
             self._asked_s = now_s
-            self._asked = drawing.camera.partition(".")[0], drawing.wanted
+            self._asked = "elsewhere"
+            if state.drawing is not None and place is not None:
+                self._asked = state.drawing.camera.partition(".")[0], place
 
     def _read(self) -> None:
         try:
@@ -172,16 +176,21 @@ class _Simulation:
 
     def __init__(self, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
         self._scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
-        camera = next(iter(views))
-        self._scene.hold(self._scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
         self._walker = Walker(self._scene, Person(), views)
+        if views:
+            camera = next(iter(views))
+            self._scene.hold(self._scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
+        else:
+            self._scene.hold(self._walker.choose())
         self._period_ns = max(model.period_ns for model in self._scene.stage.models.values())
         self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
 
-    def take(self, asked: tuple[str, Array] | None) -> list[Image | Scan]:
-        """Tell the person a camera and T_cam_board (4, 4), and take a sample of each sensor."""
+    def take(self, asked: tuple[str, Array] | Literal["elsewhere"] | None) -> list[Image | Scan]:
+        """Tell the person a camera and T_cam_board (4, 4), or to move on; take a sample of each sensor."""
         time.sleep(max(0.0, self._due_s - time.monotonic()))
-        if asked is not None:
+        if asked == "elsewhere":
+            self._walker.set_out(self._walker.choose(), self._stamp_ns * 1e-9)
+        elif asked is not None:
             self._walker.hear(*asked, self._stamp_ns * 1e-9)
         self._walker.walk(self._stamp_ns * 1e-9)
         samples = list(self._scene.take(self._stamp_ns))
@@ -237,6 +246,17 @@ class Walker:
         self._views = views
         self._rng = scene.stage.rng(_PERSON_STREAM)
         self._way: tuple[Array, Array, float, float] | None = None
+        self._n_chosen = 0
+
+    def choose(self) -> Array:
+        """Choose a placement T_world_board (4, 4) without guidance."""
+        self._n_chosen += 1
+        return self._scene.stage.place(self._n_chosen, self._rng)
+
+    def set_out(self, T_world_board: Array, now_s: float) -> None:
+        """Set out for a placement (4, 4)."""
+        way_m = float(np.linalg.norm(T_world_board[:3, 3] - self._scene.T_world_board[:3, 3]))
+        self._way = self._scene.T_world_board, T_world_board, now_s, now_s + max(way_m / WALK_MPS, 0.5)
 
     def hear(self, camera: str, wanted: Array, now_s: float) -> None:
         """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.
@@ -252,8 +272,7 @@ class Walker:
             aim = wanted if share == 1 else between(present, wanted, share)
             reached = T_world_cam @ self._person.follow(view, present, aim, self._rng)
             if self._scene.can_be_held(camera, reached):
-                way_m = float(np.linalg.norm(reached[:3, 3] - self._scene.T_world_board[:3, 3]))
-                self._way = self._scene.T_world_board, reached, now_s, now_s + max(way_m / WALK_MPS, 0.5)
+                self.set_out(reached, now_s)
                 return
 
     def walk(self, now_s: float) -> None:

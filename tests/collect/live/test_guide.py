@@ -1,6 +1,7 @@
 """Guidance over a session: what is wanted next, what adds nothing, what is learned on the way."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.guide import GIVE_UP_S, make_guides
 from lce_rig.collect.live.simulated import Person
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.rig import load_rig
 from tests.collect.live.replay import rig
 from tests.shared import changed
+
+TWO_LIDARS = Path(__file__).parents[2] / "rigs" / "two_lidars.yaml"
 
 
 @pytest.fixture
@@ -34,6 +38,22 @@ def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide
     coverage = guide.coverage()
     assert coverage is not None and coverage.left_right > 0 and coverage.tilt > 0
     assert guide.n_held == 8
+
+
+def test_placements_before_two_lidars_are_counted_if_they_differ():
+    (guide,) = make_guides(load_rig(str(TWO_LIDARS)))
+    assert guide.key == ("front", "") and guide.lidar == "side"
+    assert guide.problem is not None
+    n_enough = int(guide.problem.figure("n_captures"))
+    for k in range(n_enough):
+        there = pose(exp_so3(np.array([0.0, 0.3 * (k % 2), 0.0])), np.array([2.0 + 0.1 * k, 0.0, 0.0]))
+        assert not guide.is_enough and guide.adds_nothing(there) is None
+        guide.add(f"{k:06d}", there)
+        same = guide.adds_nothing(there)
+        assert same is not None and same.code == "calibrate.same_placement"
+    assert guide.is_enough and guide.has_enough and guide.wanted is None
+    guide.remove("000000")
+    assert not guide.is_enough
 
 
 def test_a_capture_that_is_taken_back_is_forgotten(guide):
