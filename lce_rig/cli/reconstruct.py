@@ -12,7 +12,8 @@ from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.phrasing import significant
 from lce_rig.detect.events.reconstructor import Reconstructor
-from lce_rig.detect.events.windows import measure_flicker
+from lce_rig.detect.events.windows import is_flickering
+from lce_rig.detect.findings import IMAGE_FLICKER
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
 from lce_rig.show.overlays.canvas import write_picture
@@ -55,12 +56,8 @@ def reconstruct(
     """
     reconstructor = Reconstructor()
     events = open_events(recording, topic=topic)
-    flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
-    if flicker.is_storm:
-        show.warn(
-            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz. "
-            "Record in daylight or under lamps that do not flicker."
-        )
+    if is_flickering(events.read(events.start_ns, events.start_ns + 1_000_000_000)):
+        show.warn(f"{recording.name}: {IMAGE_FLICKER.refusal().sentence}")
     stamps_ns = _stamps(recording, events, start, duration, every)
     files, refused = _write(output, reconstructor, events, stamps_ns)
     for text in events.notes:

@@ -53,17 +53,6 @@ READ_NO_EVENTS_AT_SCAN = Kind(
 )
 IMAGE_NONE = Kind("image.none", "no board in any image")
 CALIBRATE_SAME_PLACEMENT = Kind("calibrate.same_placement", "same placement as in an earlier capture")
-IMAGE_STOOD_STILL = Kind(
-    "image.stood_still",
-    "the board stood still: {events_px:.1f} events/px in 1 s",
-    "move it sideways slowly, about 10 cm/s",
-)
-IMAGE_MADE_FEW_EVENTS = Kind(
-    "image.made_few_events",
-    "the board made few events at {speed_mps:.2f} m/s: {events_px:.1f} events/px in 1 s "
-    "(minimum {min_events_px:g})",
-    "move it sideways in one direction, about 10 cm/s, in better light",
-)
 LIDAR_ELSEWHERE = Kind(
     "lidar.elsewhere",
     "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "

@@ -17,14 +17,16 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
-from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
+from lce_rig.collect.findings import READ_NO_EVENTS_AT_SCAN
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
-from lce_rig.detect.limits_met import explain_missing_board, look_for_flicker, too_fast
+from lce_rig.detect.events.windows import is_flickering
+from lce_rig.detect.findings import IMAGE_FLICKER, IMAGE_HARDLY_MOVED
+from lce_rig.detect.limits_met import explain_missing_board, too_fast
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
@@ -256,18 +258,14 @@ def _judge_camera(
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
     (speed_mps, unsteady_m), events_px = motion, event_quality(recent, stamp_ns, outline).events_px
     limits = rig.quality
-    made = {"events_px": events_px, "min_events_px": limits.min_events_px}
     if speed_mps > limits.max_board_speed_mps:
         return too_fast(speed_mps, limits)
     is_slow = speed_mps < _MIN_SPEED_MPS
-    if is_slow and events_px < max(_PLENTY_EVENTS_PX, limits.min_events_px):
-        return IMAGE_STOOD_STILL.refusal(**made)
-    if events_px < limits.min_events_px:
-        return IMAGE_MADE_FEW_EVENTS.refusal(**made, speed_mps=speed_mps)
-    if is_slow:
-        lamps = look_for_flicker(recent)
-        if lamps is not None:
-            return lamps
+    needed_px = max(_PLENTY_EVENTS_PX if is_slow else 0.0, limits.min_events_px)
+    if events_px < needed_px:
+        return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=needed_px)
+    if is_slow and is_flickering(recent):
+        return IMAGE_FLICKER.refusal()
     figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
     return CaptureMoment(detection, {name: round(figure, 5) for name, figure in figures.items()})
 

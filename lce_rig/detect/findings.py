@@ -13,15 +13,7 @@ _UNCOVER = "uncover the whole pattern, or correct board.inner_corners in the pro
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "flatten the board, or `lce-rig intrinsics {session} --save-profile FILE`"
 _CLOCKS = "check that both sensors' clocks agree"
-_NO_FLICKER = "record in daylight or under lamps that do not flicker"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
-
-
-def _flicker(finding: Finding) -> str:
-    """Most events come from light that flickers, at {frequency_hz} Hz."""
-    frequency_hz = finding.figures["frequency_hz"]
-    rhythm = f" at {frequency_hz:.0f} Hz" if frequency_hz else ""
-    return f"most events come from light that flickers{rhythm}"
 
 
 def _other_grid(finding: Finding) -> str:
@@ -181,7 +173,11 @@ IMAGE_FEW_EVENTS = Kind(
     "too few events: {n_events} in the second before the image",
     "move the board sideways, about 10 cm/s, or uncover the lens",
 )
-IMAGE_FLICKER = Kind("image.flicker", _flicker, _NO_FLICKER)
+IMAGE_FLICKER = Kind(
+    "image.flicker",
+    "most events come from light that flickers",
+    "record in daylight or under lamps that do not flicker",
+)
 IMAGE_HOT_PIXELS = Kind(
     "image.hot_pixels",
     "{n_hot} hot pixels make {share:percent} of the events; the board makes too few",

@@ -10,7 +10,7 @@ from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, busiest_events
-from lce_rig.detect.events.windows import hot_pixels, measure_flicker
+from lce_rig.detect.events.windows import hot_pixels, is_flickering
 from lce_rig.detect.findings import (
     IMAGE_FEW_EVENTS,
     IMAGE_FLICKER,
@@ -157,9 +157,8 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
     n_pixels = events.width_px * events.height_px
     if len(recent) < _MIN_EVENTS_PX * n_pixels:
         return IMAGE_FEW_EVENTS.refusal(n_events=len(recent))
-    lamps = look_for_flicker(recent)
-    if lamps is not None:
-        return lamps
+    if is_flickering(recent):
+        return IMAGE_FLICKER.refusal()
     # Count hot pixels and measure their share of the events.
     shape = recent.height_px, recent.width_px
     index = recent.y.astype(np.intp) * recent.width_px + recent.x
@@ -172,11 +171,3 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
     if events_px < needed_px:
         return IMAGE_STILL_SCENE.refusal(events_px=events_px, min_events_px=needed_px)
     return seen
-
-
-def look_for_flicker(events: Events) -> Refusal | None:
-    """Name the lamps that make most of the events of about a second; None if none do."""
-    flicker = measure_flicker(events)
-    if not flicker.is_storm:
-        return None
-    return IMAGE_FLICKER.refusal(frequency_hz=flicker.frequency_hz)

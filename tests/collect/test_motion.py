@@ -40,9 +40,9 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rles):
 @pytest.mark.parametrize(
     ("speed_mps", "rate", "lamp_hz", "code"),
     [
-        (0.0, 0.2, 0.0, "image.stood_still"),
+        (0.0, 0.2, 0.0, "image.hardly_moved"),
         (0.8, 6.0, 0.0, "image.too_fast"),
-        (0.1, 0.3, 0.0, "image.made_few_events"),
+        (0.1, 0.3, 0.0, "image.hardly_moved"),
         (0.0, 8.0, 100.0, "image.flicker"),
     ],
 )

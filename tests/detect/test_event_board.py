@@ -101,11 +101,7 @@ def test_events_are_counted_on_the_board_only(stream, detection):
         (lambda s: s.between(0, 700 * MS), "read.after_events", {"gap_s": pytest.approx(0.5, abs=1e-3)}),
         (lambda _: noise(0.8), "image.still_scene", {}),
         (lambda _: noise(0.005), "image.few_events", {}),
-        (
-            lambda _: join(noise(0.3), lamps(100)),
-            "image.flicker",
-            {"frequency_hz": pytest.approx(100, abs=1)},
-        ),
+        (lambda _: join(noise(0.3), lamps(100)), "image.flicker", {}),
     ],
 )
 def test_events_that_show_no_board_are_refused_by_their_cause(stream, events, code, figures):

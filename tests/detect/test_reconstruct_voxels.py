@@ -10,7 +10,7 @@ from moving_board import Motion, board_events, events_of, join, lamps, noise
 
 from lce_rig.detect.events.windows import (
     hot_pixels,
-    measure_flicker,
+    is_flickering,
     normalise_voxels,
     voxel_grid,
     without_background_activity,
@@ -69,20 +69,17 @@ def test_most_noise_goes_and_nearly_all_events_of_the_board_stay():
 
 
 def test_lamps_that_flicker_are_told_from_motion():
-    flicker = measure_flicker(lamps(100))
-    assert flicker.is_storm
-    assert flicker.frequency_hz == pytest.approx(100.0, abs=2.0)
-    assert flicker.coherence > 0.9
+    assert is_flickering(lamps(100))
     board = board_events(Motion(), 1.0)
     for scene in (board, noise(5.0), join(board, noise(1.0))):
-        assert not measure_flicker(scene).is_storm
+        assert not is_flickering(scene)
 
 
 def test_events_of_one_polarity_alone_are_a_storm():
     scene = noise(5.0)
-    assert measure_flicker(replace(scene, polarity=np.ones(len(scene), bool))).is_storm
+    assert is_flickering(replace(scene, polarity=np.ones(len(scene), bool)))
     sparse = noise(0.02)
-    assert not measure_flicker(sparse).is_storm
+    assert not is_flickering(sparse)
 
 
 @pytest.mark.dataset
@@ -94,7 +91,4 @@ def test_a_real_room_with_mains_light_is_told_from_one_without(recordings, name,
         pytest.skip("no recordings of events")
     recording = open_events(recordings / "events" / name)
     first_ns, last_ns = recording.span_ns
-    flicker = measure_flicker(recording.read(first_ns, last_ns))
-    assert flicker.is_storm == is_storm
-    if is_storm:
-        assert flicker.frequency_hz == pytest.approx(120.0, abs=1.0)
+    assert is_flickering(recording.read(first_ns, last_ns)) == is_storm

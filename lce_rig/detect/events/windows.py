@@ -1,6 +1,5 @@
 """Windows of events: how long they are gathered, without noise, and the arrays that they are summed into."""
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -197,69 +196,22 @@ def without_background_activity(events: Events) -> Events:
     return events.select(keep)
 
 
-_MAX_FLICKER_BINS = 20_000
 _BIN_NS = 1_000_000
-# Motion in the scene lies below, lamps and screens above.
-_MIN_FLICKER_HZ = 20.0
-# A storm: this share of all events comes in bursts of one polarity, and these bursts are regular.
-_STORM_COHERENCE = 0.5
-_STORM_PEAK_SHARE = 0.3
-# Or nearly all are of one polarity at a time, as when a light is switched; a board's edges make both.
-_ONE_SIDED_COHERENCE = 0.9
+# Of recordings under mains lamps 0.83 to 0.86, of others 0.11 to 0.28.
+_FLICKER_COHERENCE = 0.5
 
 
-@dataclass(frozen=True)
-class Flicker:
-    """How much of a stretch of events is lamps that flicker.
+def is_flickering(events: Events) -> bool:
+    """Return whether lamps that flicker, or a light that was switched, made most events of about a second.
 
-    Attributes:
-        frequency_hz: of the strongest regular alternation of polarity above 20 Hz; 0 in too short a stretch.
-        coherence: how much one polarity outweighs the other in a millisecond; near 1 where the whole image
-            brightens and darkens at once, near 0 where edges move.
-        peak_share: share of that alternation's power at the frequency and its multiples.
-    """
-
-    frequency_hz: float
-    coherence: float
-    peak_share: float
-
-    @property
-    def is_storm(self) -> bool:
-        """Whether flicker, or events of one polarity alone, drown the scene."""
-        is_regular = self.coherence > _STORM_COHERENCE and self.peak_share > _STORM_PEAK_SHARE
-        return is_regular or self.coherence > _ONE_SIDED_COHERENCE
-
-
-def measure_flicker(events: Events) -> Flicker:
-    """Measure the flicker of lamps in a stretch of about a second.
-
-    Mains lamps flicker at 100 or 120 Hz: all pixels that see them turn brighter together, then darker.
-
-    Args:
-        events: at least 0.2 s; of longer stretches the first 20 s are looked at.
+    All pixels that see such light turn brighter together, then darker; moving edges make both at any time.
+    The mean product of the polarities of two events of one millisecond, as a root, tells the two apart.
     """
     if len(events) < 2:
-        return Flicker(0.0, 0.0, 0.0)
-    # Events come in order of time: where each bin ends is found without looking at them one by one.
-    t_ns = events.t_ns[: np.searchsorted(events.t_ns, events.t_ns[0] + _BIN_NS * _MAX_FLICKER_BINS)]
-    n_bins = int((t_ns[-1] - t_ns[0]) // _BIN_NS) + 1
-    ends = np.searchsorted(t_ns, t_ns[0] + _BIN_NS * np.arange(1, n_bins + 1))
-    counts = np.diff(ends, prepend=0)
-    is_filled = counts > 0
-    n_brighter = np.zeros(n_bins, dtype=np.int64)
-    begins = (ends - counts)[is_filled]
-    n_brighter[is_filled] = np.add.reduceat(events.polarity[: ends[-1]], begins, dtype=np.int64)
-    signed = 2.0 * n_brighter - counts
-    # Mean product of the polarities of two events in one bin, as a root: few events do not look coherent.
+        return False
+    bins = (events.t_ns - events.t_ns[0]) // _BIN_NS
+    counts = np.bincount(bins)
+    signed = 2.0 * np.bincount(bins, events.polarity) - counts
+    # Few events do not look coherent: an event is not compared with itself.
     n_pairs = float((counts * (counts - 1)).sum())
-    coherence = float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0
-    power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
-    duration_s = len(signed) * _BIN_NS * 1e-9
-    slowest = int(np.ceil(_MIN_FLICKER_HZ * duration_s))
-    # Below four periods a line and its leakage are most of the spectrum.
-    if slowest < 4 or len(power) <= slowest + 1 or power.sum() == 0:
-        return Flicker(0.0, coherence, 0.0)
-    peak = slowest + int(np.argmax(power[slowest:]))
-    # A line that falls between two frequencies leaks into both.
-    lines = np.unique(np.clip(np.arange(peak, len(power), peak)[:, None] + (-1, 0, 1), 1, len(power) - 1))
-    return Flicker(peak / duration_s, coherence, float(power[lines].sum() / power.sum()))
+    return bool(n_pairs and (signed**2 - counts).sum() > _FLICKER_COHERENCE**2 * n_pairs)
