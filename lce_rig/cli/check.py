@@ -17,7 +17,6 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
-from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.pipeline.detect_session import candidates_of, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
@@ -61,7 +60,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         documents.append({**sensors, "captures": records, "findings": plates})
         if not as_json:
             if explain:
-                show.print_parts([_table(seen, pair, records), *_limits(opened.rig, seen, pair, refused)])
+                show.print_table(_table(seen, pair, records))
             show.print_parts(_head(pair, records, refused, opened.rig.quality.min_captures))
             show.print_parts(_causes([*records], refused, plates, str(session), is_whole=explain))
             show.print_parts(_repeated(placements, is_whole=explain))
@@ -162,20 +161,6 @@ def _table(detections: Detections, pair: Pair, records: Mapping[str, dict[str, A
         rows.append((name, *cells, state))
     headings = (f">{title}" for title, *_ in columns)
     return show.plain_table(str(pair), "capture", *headings, "", rows=rows)
-
-
-def _limits(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[str]:
-    """State the limit of the plane's thickness, which is by capture."""
-    limits_mm = [
-        1000 * plane_limit_m(rig.quality.max_thickness_m, lidar[0].quality.range_noise_m)
-        for name in detections.captures(pair)
-        if name not in refused and isinstance(lidar := detections.of(pair, name)[1], list)
-    ]
-    if not limits_mm:
-        return []
-    low, high = f"{min(limits_mm):.0f}", f"{max(limits_mm):.0f}"
-    noise = f"max_thickness_m {1000 * rig.quality.max_thickness_m:g} mm and the scan's noise"
-    return [f"plane: limit {low if low == high else f'{low} to {high}'} mm ({noise})"]
 
 
 def _head(

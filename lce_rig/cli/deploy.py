@@ -27,6 +27,7 @@ from lce_rig.rig.target_settings import TargetSettings
     "Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
 )
 @result_option("Deploy")
+@click.option("--robot", metavar="NAME", help="Name the robot, for a target that stands for many.")
 @click.option("--dry-run", is_flag=True, help="Print the changes; change nothing.")
 @click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print the releases at the target; change nothing.")
@@ -40,6 +41,7 @@ def deploy(
     target_name: str,
     targets: Path | None,
     name: str | None,
+    robot: str | None,
     dry_run: bool,
     diff: bool,
     status: bool,
@@ -72,18 +74,19 @@ def deploy(
 
     again = show.command("deploy", session, f" --target {shlex.quote(target_name)}")
     again += "" if targets is None else f" --targets {shlex.quote(str(targets))}"
+    again += "" if robot is None else f" --robot {shlex.quote(robot)}"
     if status or rollback:
         # A session is opened for its profile only.
         is_read = targets is None and (session / "session.json").exists()
         rig = lce.Session.open(session).rig if is_read else None
-        target = find_target(target_name, targets, session, rig)
+        target = find_target(target_name, targets, session, rig, robot)
         if status:
             _show_standing(deployment.standing(target), target, as_json=as_json)
         else:
             _show_done(deployment.rollback(target, release, reason=reason), target, again, as_json=as_json)
         return
     opened = lce.Session.open(session)
-    target = find_target(target_name, targets, session, opened.rig)
+    target = find_target(target_name, targets, session, opened.rig, robot)
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)

@@ -14,7 +14,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, json_option, path_option, registry_option, split_names
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
-from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line, significant
 from lce_rig.session.durable import write_atomically
@@ -266,13 +266,6 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     help="Choose robots by a condition in SQL, as `fleet table` does.",
 )
 @click.option("--dry-run", is_flag=True, help="Print which result would go where; change nothing.")
-@click.option("--status", is_flag=True, help="Print the release on every robot; change nothing.")
-@click.option(
-    "--rollback", is_flag=True, help="Restore the earlier files of every robot that holds its newest result."
-)
-@click.option(
-    "--reason", default="", metavar="TEXT", help="With --rollback: say why; it is written down there."
-)
 @json_option
 def deploy(
     registry: str,
@@ -280,9 +273,6 @@ def deploy(
     targets: Path,
     where: str,
     dry_run: bool,
-    status: bool,
-    rollback: bool,
-    reason: str,
     as_json: bool,
 ) -> None:
     """Put the newest result of each robot in a registry onto the robot, one after the other.
@@ -295,29 +285,19 @@ def deploy(
     from lce_rig.fleet.rollout import newest_results, roll_out
     from lce_rig.fleet.storage import Storage
 
-    if sum((dry_run, status, rollback)) > 1:
-        raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
     opened = Registry(Storage.at(registry))
     newest = newest_results(opened, where)
     if dry_run:
         rows = [map(show.escape, (robot, state.folder, state.detail)) for robot, state in newest.items()]
         show.print_table(show.plain_table("", "robot", "result", "", rows=rows))
         return
-    step: Any = "status" if status else "rollback" if rollback else "deploy"
     with show.progress_bar("robots") as progress:
-        rollout = roll_out(opened, target, targets, newest, step, reason=reason, progress=progress)
+        rollout = roll_out(opened, target, targets, newest, progress=progress)
     if as_json:
         show.print_json({"format_version": 2, **vars(rollout)})
     else:
         counts = ", ".join(f"{_words(state)} {n}" for state, n in rollout.counts.most_common())
         show.say(f"{rollout.target}: {counts or 'no robots'}")
-        if status:
-            cells = (
-                (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
-                for state in rollout.robots.values()
-            )
-            rows = [map(show.escape, each) for each in cells]
-            show.print_table(show.plain_table("", "robot", "state", "release", "replaces", rows=rows))
         for state in rollout.robots.values():
             if state.detail:
                 show.note(f"{state.robot}: {_line(state)}")
@@ -325,8 +305,8 @@ def deploy(
         stopped = rollout.robots[rollout.stopped_by]
         raise ResultRefusedError(
             f"stopped at {stopped.robot}: {_line(stopped)}",
-            "Remove the cause and run it again. To restore every robot's earlier files: "
-            f"`lce-rig fleet deploy --registry {shlex.quote(registry)} --target {target} --rollback`",
+            "Remove the cause and run it again. To restore a robot's earlier files: "
+            f"`lce-rig deploy --target {target} --targets {targets} --robot {stopped.robot} --rollback`",
         )
 
 

@@ -149,7 +149,7 @@ def table_bytes(table: Any) -> bytes:
 
 
 def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) -> Any:
-    """Read a table as a `pyarrow.Table`; columns that an earlier version did not write are null.
+    """Read a table as a `pyarrow.Table`.
 
     Args:
         source: its file, or the file's content.
@@ -160,9 +160,7 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
     """
     names = list(SCHEMA.names if columns is None else columns)
     try:
-        with pq.ParquetFile(source) as file:
-            held = set(file.schema_arrow.names)
-            table = file.read(columns=[name for name in names if name in held])
+        table = pq.read_table(source, columns=names)
     except FileNotFoundError:
         raise SessionError(
             f"{source}: there is no such table", "`lce-rig fleet run ROOT --registry FOLDER` writes it."
@@ -172,12 +170,11 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
             f"{source} cannot be read as a table: {error}",
             "`lce-rig fleet table --registry FOLDER --rebuild` writes it again.",
         ) from error
-    if "robot" not in held:
-        raise SessionError(f"{source} is not a table of results: it has no column robot")
-    for name in names:
-        if name not in held:
-            table = table.append_column(SCHEMA.field(name), pa.nulls(len(table), SCHEMA.field(name).type))
-    return table.select(names).cast(pa.schema([SCHEMA.field(name) for name in names]))
+    if table.column_names != names:
+        raise SessionError(
+            f"{source} lacks columns of this version", "Write it again: `lce-rig fleet table --rebuild`."
+        )
+    return table.cast(pa.schema([SCHEMA.field(name) for name in names]))
 
 
 def chosen_rows(table: Any, where: str) -> Any:

@@ -45,7 +45,9 @@ def read_targets(path: Path) -> dict[str, TargetSettings]:
     return {name: target.located(path.parent) for name, target in content.targets.items()}
 
 
-def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | None) -> TargetSettings:
+def find_target(
+    name: str, file: Path | None, session: Path | None, rig: Rig | None, robot: str | None = None
+) -> TargetSettings:
     """Find a target: in the file if one is given, else beside the session, else in its profile.
 
     Args:
@@ -53,6 +55,7 @@ def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | N
         file: that lists targets.
         session: its folder; deploy.yaml is looked for in its parent.
         rig: the session's profile.
+        robot: for a target that stands for many.
 
     Raises:
         ProfileError: a file is invalid.
@@ -68,12 +71,9 @@ def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | N
             targets |= read_targets(beside)
     target = targets.get(name)
     if target is not None and ROBOT_FIELD in target.to:
-        if not target.robot:
-            raise UsageError(
-                f"target {name!r} stands for many robots",
-                f"Use `lce-rig fleet deploy --registry FOLDER --target {name}`.",
-            )
-        return target.for_robot(target.robot)
+        with suppress(ValueError):
+            return target.for_robot(robot or target.robot or "")
+        raise UsageError(f"target {name!r} stands for many robots", "Add --robot NAME.")
     if target is not None:
         return target
     where = file or beside or TARGETS_FILE

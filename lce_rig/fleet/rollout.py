@@ -1,10 +1,9 @@
 """Put the newest results of many robots onto them, one after the other, until the first failure.
 
 Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
-continues after an interrupt, and a rollback restores what such robots held before.
+continues after an interrupt.
 """
 
-import hashlib
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,12 +18,11 @@ from lce_rig.fleet import deployment
 from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.releases import read_targets
-from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session.session import PROFILE
 
-State: TypeAlias = Literal["waiting", "in_place", "left_out", "failed", "rolled_back", "not_rolled_back"]
+State: TypeAlias = Literal["waiting", "in_place", "left_out", "failed"]
 _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
 
@@ -35,9 +33,9 @@ class RobotState:
     Attributes:
         robot: its name.
         folder: of its newest result in the registry.
-        state: "waiting" while this result is not in place.
+        state: "waiting" until it was reached.
         to: the place of its files.
-        release: the release that is current there; "" if there is none or it was not asked.
+        release: that is current there afterwards; "" if it is not known.
         replaces: the release that it replaced; "" if there was none.
         detail: cause and action.
     """
@@ -58,7 +56,7 @@ class RobotState:
 
 @dataclass
 class Rollout:
-    """The outcome of a roll-out, of a question for its state, or of a rollback.
+    """The outcome of a roll-out.
 
     Attributes:
         target: its name.
@@ -108,23 +106,18 @@ def roll_out(
     target: str,
     file: Path,
     wanted: Mapping[str, RobotState],
-    step: Literal["deploy", "status", "rollback"] = "deploy",
     *,
-    reason: str = "",
     progress: Progress = silent,
 ) -> Rollout:
-    """Deploy to one robot after the other, ask each for what it holds, or restore its earlier release.
+    """Deploy to one robot after the other, until one fails.
 
-    Deploying stops at the first robot that fails; robots that hold their result are not written again. The
-    earlier release is restored on robots that hold their newest result. Robots that are left out stay so.
+    Robots that hold their result are not written again. Robots that are left out stay so.
 
     Args:
         registry: with the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
         file: that lists targets.
         wanted: as `newest_results` gives them.
-        step: at each robot.
-        reason: of a rollback; it is written down there.
         progress: called with (done, total) robots.
 
     Raises:
@@ -143,45 +136,15 @@ def roll_out(
                 except ValueError as error:
                     what = f"it cannot be part of {targets[target].to}"
                     raise UsageError(what, "Rename the robot.") from error
-                state = replace(state, to=of_robot.to)
-                if step == "deploy":
-                    state = _deploy(registry, state, of_robot)
-                else:
-                    state = _ask(registry, state, of_robot)
-                    state = _restore(state, of_robot, reason) if step == "rollback" else state
+                state = _deploy(registry, replace(state, to=of_robot.to), of_robot)
             except (LceRigError, OSError) as error:
                 state = state.ended("failed", error)
         rollout.robots[state.robot] = state
         progress(done, len(wanted))
-        if step == "deploy" and state.state == "failed":
+        if state.state == "failed":
             rollout.stopped_by = state.robot
             break
     return rollout
-
-
-def _ask(registry: Registry, state: RobotState, target: TargetSettings) -> RobotState:
-    """Ask a robot whether its current release has its newest result."""
-    current = deployment.standing(target).current
-    if current is None:
-        return state.ended("waiting", "nothing is deployed there")
-    state = replace(state, release=current.name, replaces=current.replaces)
-    newest = (registry.place / state.folder / RESULT).read() or b""
-    if current.files.get(RESULT) != hashlib.sha256(newest).hexdigest():
-        return state.ended("waiting", f"{current.name} holds another result")
-    return state.ended("in_place")
-
-
-def _restore(state: RobotState, target: TargetSettings, reason: str) -> RobotState:
-    """Restore the release that a robot's newest result has replaced."""
-    if state.state != "in_place":
-        return state.ended("not_rolled_back", state.detail)
-    if not state.replaces:
-        return state.ended("not_rolled_back", "it is the first release there")
-    try:
-        deployment.rollback(target, state.replaces, reason=reason)
-    except CommandError as error:
-        return state.ended("rolled_back", error)
-    return state.ended("rolled_back")
 
 
 def _deploy(registry: Registry, state: RobotState, target: TargetSettings) -> RobotState:
@@ -193,6 +156,7 @@ def _deploy(registry: Registry, state: RobotState, target: TargetSettings) -> Ro
             done = deployment.deploy(folder, load_rig(folder / PROFILE), target)
         except CommandError as error:
             with suppress(LceRigError):
-                state = _ask(registry, state, target)
+                current = deployment.standing(target).current
+                state = state if current is None else replace(state, release=current.name)
             return state.ended("failed", error)
         return replace(state, release=done.release.name, replaces=done.replaces).ended("in_place")

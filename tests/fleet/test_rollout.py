@@ -83,7 +83,6 @@ def test_every_robot_gets_its_own_newest_result(registry, targets, add):
         content = json.loads(held(targets, robot) or b"{}")
         assert content["provenance"]["robot"] == robot
         assert content["pairs"][0]["T_cam_lidar"][0][3] == (0.2 if robot == "r2" else 0.1)
-    assert states(roll_out(registry, "nav", targets, newest_results(registry), "status")) == states(rollout)
 
 
 @pytest.mark.usefixtures("whole")
@@ -136,38 +135,7 @@ def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(registry,
 
 
 @pytest.mark.usefixtures("whole")
-def test_all_robots_are_rolled_back_byte_for_byte(registry, targets, add):
-    deploy(registry, targets)
-    first = {robot: held(targets, robot) for robot in ROBOTS}
-    for robot in ROBOTS[:-1]:
-        add(robot, "2026-02-01T10:00:00Z", 0.3)
-    (targets.parent / "robots" / "r2" / "broken").touch()
-    assert deploy(registry, targets).stopped_by == "r2"
-    assert held(targets, "r1") != first["r1"] and held(targets, "r2") != first["r2"]
-    (targets.parent / "robots" / "r2" / "broken").unlink()
-    rollout = roll_out(registry, "nav", targets, newest_results(registry), "rollback", reason="sensor recall")
-    assert {robot: held(targets, robot) for robot in ROBOTS} == first
-    # The last one's release is its first: nothing came before.
-    assert states(rollout) == dict.fromkeys(ROBOTS[:-1], "rolled_back") | {"r3": "not_rolled_back"}
-
-
-@pytest.mark.usefixtures("whole")
-def test_robots_that_hold_another_result_are_not_rolled_back(registry, targets, add):
-    deploy(registry, targets)
-    add("r1", "2026-04-01T10:00:00Z", 0.4)
-    deploy(registry, targets)
-    for state in ("rolled_back", "not_rolled_back"):
-        assert states(
-            roll_out(registry, "nav", targets, newest_results(registry, "robot = 'r1'"), "rollback")
-        ) == {"r1": state}
-    assert roll_out(registry, "nav", targets, newest_results(registry), "status").counts == {
-        "in_place": 2,
-        "waiting": 1,
-    }
-
-
-@pytest.mark.usefixtures("whole")
-def test_the_verb_plans_deploys_shows_and_rolls_back(targets, capsys):
+def test_the_verb_plans_and_deploys(targets, capsys):
     def call(*options):
         place = ["--registry", str(targets.parent / "registry"), "--targets", str(targets)]
         capsys.readouterr()
@@ -183,10 +151,9 @@ def test_the_verb_plans_deploys_shows_and_rolls_back(targets, capsys):
     code, said = call("--json", "--where", "robot <> 'r3'")
     in_place = {name: each["state"] for name, each in json.loads(said)["robots"].items()}
     assert code == 0 and in_place == dict.fromkeys(ROBOTS[:-1], "in_place")
-    code, shown = call("--status")
-    assert code == 0 and all(robot in shown for robot in ROBOTS[:-1])
-    assert call("--rollback", "--reason", "test")[0] == 0
-    assert call("--status", "--rollback")[0] == 2
+    of_robot = ["deploy", str(targets.parent), "--targets", str(targets), "--target", "nav", "--robot", "r2"]
+    assert run([*of_robot, "--status"]) == 0 and "r2" in capsys.readouterr().out
+    assert run([*of_robot[:-1], "../r2", "--status"]) == 2
 
 
 @pytest.mark.parametrize(
