@@ -5,7 +5,6 @@ import selectors
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from fcntl import F_SETPIPE_SZ, fcntl
 from typing import IO
@@ -111,19 +110,16 @@ class ImagePipeSource(LiveSource):
                 if not data:
                     self._selector.unregister(complaints)
             elif data:
-                samples += self._to_images(data)
+                self._rest += data
             else:
                 self._raise_end(pictures)
-        return samples
-
-    def _to_images(self, data: bytes) -> Iterator[Image]:
-        self._rest += data
-        n_bytes = self._decoder.n_bytes
+        n_bytes, host_ns = self._decoder.n_bytes, time.time_ns()
         while len(self._rest) >= n_bytes:
-            host_ns, pixels = time.time_ns(), self._decoder.decode(bytes(self._rest[:n_bytes]))
+            pixels = self._decoder.decode(bytes(self._rest[:n_bytes]))
             del self._rest[:n_bytes]
+            samples.append(Image(self.sensor, self._channel, host_ns, pixels, host_ns, self._n_images))
             self._n_images += 1
-            yield Image(self.sensor, self._channel, host_ns, pixels, host_ns, self._n_images - 1)
+        return samples
 
     def _raise_end(self, pictures: IO[bytes]) -> None:
         """Report the end of the command.
@@ -140,13 +136,11 @@ class ImagePipeSource(LiveSource):
         how = "closed its output" if code is None else f"ended with exit code {code}"
         if code is not None and code < 0:
             how = f"was ended by {signal.Signals(-code).name}"
-        raise SourceError(f"{self._who}: its command {how} after {self._n_images} images", self._complaint())
-
-    def _complaint(self) -> str:
         lines = self._complaints.decode("utf-8", "replace").strip().splitlines()[-3:]
+        hint = f"Run it in a shell: {' '.join(self._settings.driver.command)}"
         if lines:
-            return f"It said: {' | '.join(line.strip() for line in lines)}"
-        return f"Run it in a shell: {' '.join(self._settings.driver.command)}"
+            hint = f"It said: {' | '.join(line.strip() for line in lines)}"
+        raise SourceError(f"{self._who}: its command {how} after {self._n_images} images", hint)
 
 
 def _end_process(process: "subprocess.Popen[bytes]") -> None:

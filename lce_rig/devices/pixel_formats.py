@@ -124,7 +124,15 @@ class PixelDecoder:
             return pixels
         values: NDArray[Any]
         if self._form.n_chroma_planes:
-            values = self._planes(np.frombuffer(data, np.uint8))
+            # The planes (3/2 H, W) of 4:2:0 close together, as OpenCV wants them.
+            flat, n_luma, n_planes = (
+                np.frombuffer(data, np.uint8),
+                self._stride * height,
+                self._form.n_chroma_planes,
+            )
+            luma = flat[:n_luma].reshape(height, self._stride)[:, :width]
+            chroma = flat[n_luma : self.n_bytes].reshape(n_planes * (height // 2), self._stride // n_planes)
+            values = np.concatenate((luma, chroma[:, : width // n_planes].reshape(height // 2, width)))
         else:
             kind, n_channels = np.dtype("<u2" if self._form.bits > 8 else "u1"), self._form.n_channels
             strides = self._stride, n_channels * kind.itemsize, kind.itemsize
@@ -138,13 +146,3 @@ class PixelDecoder:
         if not self._form.conversion:
             return np.array(values, dtype=np.uint8)
         return np.asarray(self._cv2.cvtColor(values, self._conversion), dtype=np.uint8)
-
-    def _planes(self, data: Pixels) -> Pixels:
-        """Lay the planes (3/2 H, W) of 4:2:0 close together, as OpenCV wants them."""
-        width, height = self._size
-        n_luma = self._stride * height
-        luma = data[:n_luma].reshape(height, self._stride)[:, :width]
-        n_planes = self._form.n_chroma_planes
-        n_rows = n_planes * (height // 2)
-        chroma = data[n_luma : self.n_bytes].reshape(n_rows, self._stride // n_planes)
-        return np.concatenate((luma, chroma[:, : width // n_planes].reshape(height // 2, width)))

@@ -86,7 +86,11 @@ class Ros2Source(LiveSource):
         self._msgtype = self._find_type(node)
         package, _, name = self._msgtype.partition("/")
         kind = getattr(import_module(f"{package}.msg"), name)
-        node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
+
+        def receive(data: bytes) -> None:
+            self._waiting.append((time.time_ns(), bytes(data)))
+
+        node.create_subscription(kind, self._topic, receive, qos_profile_sensor_data, raw=True)
         self._waiting.clear()
 
     def close(self) -> None:
@@ -115,9 +119,6 @@ class Ros2Source(LiveSource):
         problems = (findings.MESSAGES_SKIPPED(n=n_lost),) if n_lost else ()
         device = f"{self._topic} ({self._msgtype})" if self._msgtype else self._topic
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)
-
-    def _receive(self, data: bytes) -> None:
-        self._waiting.append((time.time_ns(), bytes(data)))
 
     def _find_type(self, node: Any) -> str:
         """Wait until the topic is published, and name its type without ROS 2's "/msg".

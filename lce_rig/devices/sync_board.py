@@ -70,7 +70,16 @@ class SyncBoard(LiveSource):
         Raises:
             SourceError: the port cannot be opened, or the board is silent or talks otherwise.
         """
-        self._port = self._open_port()
+        # DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
+        # them for a moment all the same.
+        port = serial.Serial(baudrate=self._settings.port_baud, timeout=_READ_S, write_timeout=_WRITE_S)
+        port.port, port.exclusive = self._settings.device, True
+        port.dtr = port.rts = False
+        try:
+            port.open()
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise self._explain(error) from None
+        self._port = port
         self._early, self._heard, self._is_set_up = [], b"", False
         with self._lock:
             self._state.opened(time.monotonic_ns())
@@ -165,21 +174,6 @@ class SyncBoard(LiveSource):
         with self._lock:
             self._rate_hz = rate_hz
             self._set_lines()
-
-    def _open_port(self) -> serial.Serial:
-        """Open the serial port for this program alone.
-
-        DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
-        them for a moment all the same.
-        """
-        port = serial.Serial(baudrate=self._settings.port_baud, timeout=_READ_S, write_timeout=_WRITE_S)
-        port.port, port.exclusive = self._settings.device, True
-        port.dtr = port.rts = False
-        try:
-            port.open()
-        except (serial.SerialException, OSError, ValueError) as error:
-            raise self._explain(error) from None
-        return port
 
     def _write(self, data: bytes) -> int:
         """Send a command; gives the time of day in ns when it went out."""

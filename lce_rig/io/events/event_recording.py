@@ -266,7 +266,10 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
             held = join_events([held, current])
         if np.all(held.t_ns[1:] >= held.t_ns[:-1]):
             continue
-        stray = _stray(held.t_ns)
+        late = np.maximum.accumulate(held.t_ns) - held.t_ns > REORDER_NS
+        early = held.t_ns - np.minimum.accumulate(held.t_ns[::-1])[::-1] > REORDER_NS
+        # One timestamp too far ahead makes all that follow look late, and the reverse: the fewer are stray.
+        stray = min(late, early, key=np.count_nonzero)
         if stray.any():
             where = f"after {held.t_ns[max(int(np.argmax(stray)) - 1, 0)] * 1e-9:.3f} s"
             losses.add(findings.EVENTS_STRAY(where=where), int(np.count_nonzero(stray)))
@@ -278,11 +281,3 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
             delivered_ns, held = int(held.t_ns[cut - 1]), held.select(slice(cut, None))
     if len(held):
         yield held
-
-
-def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Find the timestamps that do not fit the others, (N,)."""
-    late = np.maximum.accumulate(t_ns) - t_ns > REORDER_NS
-    early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
-    # One timestamp too far ahead makes all that follow look late, and the reverse: the fewer are stray.
-    return min(late, early, key=np.count_nonzero)
