@@ -35,34 +35,9 @@ _WINDOW_NS = 60 * NS_PER_S
 Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class TimePairs:
-    """Times, each read on two clocks.
-
-    Attributes:
-        source_ns: (N,) reading of the clock to be modelled; rising.
-        reference_ns: (N,) reading of the clock that it is modelled on.
-        bound_ns: (N,) by how much the two readings may lie apart in truth; 0 where they are of one edge.
-    """
-
-    source_ns: Stamps
-    reference_ns: Stamps
-    bound_ns: Array
-
-    @staticmethod
-    def from_edges(source_ns: Stamps, reference_ns: Stamps) -> "TimePairs":
-        """Take edges (N,) that both clocks timestamped."""
-        return TimePairs(source_ns, reference_ns, np.zeros(len(source_ns)))
-
-    def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> "TimePairs":
-        """Keep the pairs of a mask or an index."""
-        return TimePairs(self.source_ns[keep], self.reference_ns[keep], self.bound_ns[keep])
-
-    def __len__(self) -> int:
-        return len(self.source_ns)
-
-
-def fit_clock(pairs: TimePairs, what: str) -> ClockModel | None:
+def fit_clock(
+    source_ns: Stamps, reference_ns: Stamps, what: str, bound_ns: Array | None = None
+) -> ClockModel | None:
     """Fit offset and drift to readings of two clocks, without outliers.
 
     The quickest two fifths of the readings count. What one of them took beyond the very quickest,
@@ -76,22 +51,27 @@ def fit_clock(pairs: TimePairs, what: str) -> ClockModel | None:
     is stated as bias_sigma = min bound / sqrt(3).
 
     Args:
-        pairs: the readings.
+        source_ns: (N,) readings of the clock to be modelled; rising.
+        reference_ns: (N,) readings of the clock that it is modelled on.
         what: what they are, in words: "time requests".
+        bound_ns: (N,) by how much two readings may lie apart in truth; None where they are of one edge.
 
     Returns:
         The model; None from fewer than 4 readings, or where all are of the same time.
     """
-    if len(pairs) < MIN_PAIRS:
+    n_readings = len(source_ns)
+    if n_readings < MIN_PAIRS:
         return None
-    n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * len(pairs))))
-    quick = pairs.select(pairs.bound_ns <= np.sort(pairs.bound_ns)[n_quick - 1])
-    source_ns, least_ns = quick.source_ns, float(quick.bound_ns.min())
+    bound_ns = np.zeros(n_readings) if bound_ns is None else bound_ns
+    n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * n_readings)))
+    is_quick = bound_ns <= np.sort(bound_ns)[n_quick - 1]
+    source_ns, reference_ns, bound_ns = source_ns[is_quick], reference_ns[is_quick], bound_ns[is_quick]
+    least_ns = float(bound_ns.min())
     if source_ns.min() == source_ns.max():
         return None
-    origin_ns, reference_origin_ns = int(source_ns[0]), int(quick.reference_ns[0])
-    y_ns = ((quick.reference_ns - reference_origin_ns) - (source_ns - origin_ns)).astype(np.float64)
-    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns, quick.bound_ns - least_ns)
+    origin_ns, reference_origin_ns = int(source_ns[0]), int(reference_ns[0])
+    y_ns = ((reference_ns - reference_origin_ns) - (source_ns - origin_ns)).astype(np.float64)
+    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns, bound_ns - least_ns)
     keep = fit.inliers()
     fit = fit.select(keep).centred()
     line, residual = fit.solve()
@@ -107,13 +87,13 @@ def fit_clock(pairs: TimePairs, what: str) -> ClockModel | None:
         first_ns=int(source_ns[keep].min()),
         last_ns=int(source_ns[keep].max()),
         n_used=int(keep.sum()),
-        origin=f"{len(pairs)} {what}",
+        origin=f"{n_readings} {what}",
     )
 
 
 def match_edges(
     source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
-) -> TimePairs:
+) -> tuple[Stamps, Stamps]:
     """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
 
     Args:
@@ -123,13 +103,13 @@ def match_edges(
         tolerance_ns: how far off it may be.
 
     Returns:
-        Edges that are nearest to each other both ways and within the tolerance.
+        The edges (K,) on both clocks that are nearest to each other both ways and within the tolerance.
     """
     predicted_ns = coarse.convert_all(source_ns)
     edge = nearest(predicted_ns, reference_ns)
     is_mutual = nearest(reference_ns, predicted_ns)[edge] == np.arange(len(source_ns))
     keep = is_mutual & (np.abs(predicted_ns - reference_ns[edge]) <= tolerance_ns)
-    return TimePairs.from_edges(source_ns[keep], reference_ns[edge[keep]])
+    return source_ns[keep], reference_ns[edge[keep]]
 
 
 def nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
@@ -321,8 +301,8 @@ class ClockTracker:
     def _latest(self, max_new: int) -> ClockModel | None:
         if self._n_new >= max_new and len(self._pairs) >= MIN_PAIRS:
             source, reference, bound = zip(*self._pairs, strict=True)
-            pairs = TimePairs(np.array(source, np.int64), np.array(reference, np.int64), np.array(bound))
-            self._model = fit_clock(pairs, self._what)
+            stamps = np.array(source, np.int64), np.array(reference, np.int64)
+            self._model = fit_clock(*stamps, self._what, np.array(bound))
             self._n_new = 0
         return self._model
 

@@ -117,11 +117,11 @@ class EdgeClock:
             sigma_ms, period_ms = self._coarse_error_ns / 1e6, least_ns / 1e6
             self.problem = findings.EDGES_TOO_CLOSE(self._sensor, sigma_ms=sigma_ms, period_ms=period_ms)
             return None
-        pairs = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
-        if len(pairs) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
+        edges = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
+        if len(edges[0]) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
             self.problem = findings.EDGES_NOT_THE_PULSES(self._sensor)
             return None
-        self._model, self.problem = fit_clock(pairs, "edges"), None
+        self._model, self.problem = fit_clock(*edges, "edges"), None
         return self._model
 
 

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import SyncSettings
-from lce_rig.timing.clock_fit import TimePairs, fit_clock
+from lce_rig.timing.clock_fit import fit_clock
 from lce_rig.timing.rig_clock import RigClock
 
 T0_NS = 1_700_000_000_000_000_000
@@ -18,7 +18,7 @@ LOCKED = ["lidar"]
 
 
 def tie(source_ns, reference_ns):
-    model = fit_clock(TimePairs.from_edges(source_ns, reference_ns), "edges")
+    model = fit_clock(source_ns, reference_ns, "edges")
     assert model is not None
     return model
 

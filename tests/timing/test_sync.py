@@ -6,7 +6,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Pulse, Scan
 from lce_rig.core.findings import Losses
 from lce_rig.timing.clock import ClockModel
-from lce_rig.timing.clock_fit import TimePairs, fit_clock
+from lce_rig.timing.clock_fit import fit_clock
 from lce_rig.timing.rig_clock import EdgeClock, RigClock
 from lce_rig.timing.scan_pairing import pair_by_time
 from tests.shared import changed
@@ -31,7 +31,7 @@ def fitted(seed=0, noise_ns=30_000.0, drift=50e-6):
     times = np.int64(np.arange(100) * 0.1 * S)
     stamps = np.int64(times * (1 + drift)) + 90 * S
     seen = UTC_NS + times + np.int64(rng.normal(scale=noise_ns, size=100))
-    model = fit_clock(TimePairs.from_edges(stamps, seen), "edges")
+    model = fit_clock(stamps, seen, "edges")
     return model, lambda true_ns: 90 * S + round((true_ns - UTC_NS) * (1 + drift))
 
 
