@@ -110,11 +110,6 @@ class CalibrationEstimate:
         """Mean over captures of `CaptureResidual.held_out_m`."""
         return float(np.mean([residual.held_out_m for residual in self.residuals]))
 
-    @property
-    def lever_m(self) -> float:
-        """Rms distance of the boards from the camera."""
-        return lever_arm(list(self.observations.values()))
-
     def captures_of(self, names: Iterable[str]) -> set[str]:
         """Name every capture that holds the scan of one of the captures named."""
         return {capture for name in names for capture in self.same_scan.get(name, (name,))}

@@ -27,7 +27,7 @@ from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.phrasing import motion_words, sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
-from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures, weakest_words
+from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -66,8 +66,6 @@ def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
         return
     if c.scene_share is not None and c.scene_share.state == "used":
         yield f"               of the boards alone {sizes(*sigma_sizes(c.scene_share.cov_boards))}"
-    if c.weakest:
-        yield f"  weakest: {weakest_words(c.weakest)}"
     rows = {
         "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
         "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],

@@ -28,7 +28,7 @@ from pydantic import (
 import lce_rig
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
-from lce_rig.core.findings import Figure, Finding, Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
 from lce_rig.core.results import Observation
 
@@ -277,30 +277,6 @@ MOTIONS: tuple[Motion, ...] = get_args(Motion)
 """Motions along and about the camera's axes, in the order of a tangent (6,)."""
 
 
-@dataclass(frozen=True)
-class WeakestMotion:
-    """The motion of an extrinsic that its captures determine least.
-
-    Attributes:
-        motion: its main component, axes of the camera.
-        sigma: standard deviation of that, m or rad.
-    """
-
-    motion: Motion
-    sigma: float
-
-    @property
-    def is_rotation(self) -> bool:
-        """Whether the motion is a rotation."""
-        return MOTIONS.index(self.motion) >= 3
-
-    def figures(self) -> dict[str, Figure]:
-        """Give motion and standard deviation as figures of a finding."""
-        if self.is_rotation:
-            return {"weakest": self.motion, "weakest_sigma_deg": math.degrees(self.sigma)}
-        return {"weakest": self.motion, "weakest_sigma_m": self.sigma}
-
-
 @dataclass(frozen=True, eq=False)
 class SceneShare:
     """The change of the boards' extrinsics by the edges of the scene.
@@ -412,7 +388,7 @@ class Calibration:
     Of two LiDARs, `camera` names the first of the profile, which has no channel: T_cam_lidar takes points
     from the second one's frame to the first's, and all axes of the camera are those of the first LiDAR.
 
-    result.json keeps all of it but the last four attributes, which are empty if it is read back.
+    result.json keeps all of it but the last three attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
@@ -442,7 +418,6 @@ class Calibration:
         scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
-        weakest: the least determined motion; None if it is read back.
         held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
@@ -494,7 +469,6 @@ class Calibration:
         | None
     ) = None
     board_distances_m: tuple[Size, ...] = ()
-    weakest: Annotated[WeakestMotion | None, _ANY, _IN_MEMORY] = None
     held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)

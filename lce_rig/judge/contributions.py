@@ -9,18 +9,16 @@ deviations, widens the claim until it holds both.
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
 from lce_rig.core.calibration import Contribution, Diagnostics
-from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.judge.findings import LARGEST_CAUSE
 from lce_rig.judge.split_consistency import Contrast, objections
-from lce_rig.rig import CalibrationSettings, Rig
+from lce_rig.rig import Rig
 
 # Scales differ significantly beyond this many standard deviations.
 _SURE = 3.0
@@ -101,24 +99,3 @@ def measure_action(source: str) -> str:
     if source.startswith(_CONTRADICTION):
         return "resolve"
     return f"measure_{source}" if source in get_args(Source) else ""
-
-
-def uncertainty_notes(causes: Sequence[Contribution], target: CalibrationSettings) -> Iterator[Finding]:
-    """Name the largest cause of the standard deviations.
-
-    The larger of rotation and translation counts, in units of the target.
-    """
-    if any(each.source in get_args(Source) for each in causes):
-        sizes = [(each.sigma_rotation_deg, each.sigma_translation_m) for each in causes]
-        total_deg, total_m = np.sqrt(np.nansum(np.square(sizes), axis=0)).tolist()
-        is_rotation = total_deg / target.target_sigma_deg > total_m / target.target_sigma_m
-        size, unit = ("sigma_rotation_deg", "deg") if is_rotation else ("sigma_translation_m", "m")
-        source, total = largest(causes, size), total_deg if is_rotation else total_m
-        part = next(float(getattr(each, size)) for each in causes if each.source == source)
-        figures: dict[str, Any] = {
-            "source": source,
-            f"sigma_{unit}": part,
-            f"total_{unit}": total,
-            "share": (part / total) ** 2,
-        }
-        yield LARGEST_CAUSE(action=measure_action(source), **figures)

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
-from lce_rig.core.calibration import WeakestMotion
 from lce_rig.core.findings import Figure, Finding, Kind, Severity, worst
 from lce_rig.core.phrasing import fill
 
@@ -90,8 +89,6 @@ _CONTRADICTIONS = {
     "cameras": "the cameras",
     "group_rest": "two groups of captures",
 }
-_LEAST_ROTATION = "{weakest:motion}, sigma {weakest_sigma_deg:3deg}"
-_LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
@@ -145,11 +142,6 @@ def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 def failing(is_fail: bool) -> Severity:
     """Return the severity of a finding that prevents a pass: an error if the result fails by it."""
     return "error" if is_fail else "warning"
-
-
-def weakest_words(weakest: WeakestMotion) -> str:
-    """Name the least determined motion with its standard deviation."""
-    return fill(_LEAST_ROTATION if weakest.is_rotation else _LEAST_TRANSLATION, weakest.figures())
 
 
 def cause_words(source: str) -> str:
@@ -230,17 +222,6 @@ def _scale(finding: Finding) -> str:
     return f"{squares}, or another lens: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
 
 
-def _largest_cause(finding: Finding) -> str:
-    """Largest cause of the uncertainty {total:size}: {source}, {sigma:size} ({share} of the variance)."""
-    what = "translation" if "sigma_m" in finding.figures else "rotation"
-    figures = {**finding.figures, "source": cause_words(str(finding.figures["source"])), "what": what}
-    return fill(
-        "largest cause of the {what}'s uncertainty: {source}, {sigma:1size} of {total:1size} "
-        "({share:percent} of the variance)",
-        figures,
-    )
-
-
 def _plate(finding: Finding) -> str:
     """Plates measure {measured_m} in {side} in {n_captures} captures, the profile says {profile_m}."""
     percent = 100 * (finding.figure("measured_m") / finding.figure("profile_m") - 1)
@@ -294,12 +275,6 @@ _SCENE_CHANGE = (
     "(expected {rotation_sigma_deg:deg}, {translation_sigma_m:mm}; {n_captures} captures, {n_edges} edges)"
 )
 
-NO_CERTIFICATE = Kind(
-    "verdict.no_certificate",
-    "not certified: method {method} has no certificate",
-    "`lce-rig calibrate {session} --method paper`",
-    severity="warning",
-)
 NOT_CERTIFIED = Kind(
     "verdict.not_certified", "not certified as the global minimum (gap {gap:.1e})", "collect more captures"
 )
@@ -474,7 +449,6 @@ OTHER_MODEL = Kind(
     "{subject}: the scans have a ring {ring}; a {model} has {n_lasers} rings, counted from 0",
     "correct the model, or the topics and files if LiDARs are exchanged",
 )
-LARGEST_CAUSE = Kind("verdict.largest_cause", _largest_cause, severity="note", actions=_MEASURE)
 MAY_BE_OFF = Kind(
     "verdict.may_be_off",
     "with 95 % probability each, the rotation is off by less than {rotation_deg:deg} and the translation by "

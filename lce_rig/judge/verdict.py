@@ -8,12 +8,12 @@ import numpy as np
 
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare, WeakestMotion
+from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare
 from lce_rig.core.findings import Finding, Refusal, Severity
 from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
-from lce_rig.judge.contributions import largest, measure_action, uncertainty_notes
+from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
     CHANNELS_DIFFER,
     EDGE_RESIDUAL,
@@ -24,7 +24,6 @@ from lce_rig.judge.findings import (
     LAST_REJECTED,
     MAY_BE_OFF,
     MOVED,
-    NO_CERTIFICATE,
     NOT_CERTIFIED,
     PATTERN_OFFSET,
     PLANE_RESIDUAL,
@@ -107,7 +106,6 @@ def judge(
         *_nominal(estimate.T_cam_lidar if T_view is None else invert(T_view) @ estimate.T_cam_lidar, nominal),
         *_precision(estimate, examination, rig),
     ]
-    findings += uncertainty_notes(examination.contributions, rig.calibration)
     is_weighed = estimate.method == "ml" and estimate.lens is not None
     return _verdict(_blame_lens(_weigh_scale(findings, is_weighed)), examination.cov)
 
@@ -210,11 +208,7 @@ def share_findings(share: SceneShare) -> list[Finding]:
 
 
 def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
-    if estimate.certificate.is_optimal:
-        return []
-    if np.isinf(estimate.certificate.gap):
-        return [NO_CERTIFICATE(method=estimate.method)]
-    return [NOT_CERTIFIED(gap=estimate.certificate.gap)]
+    return [] if estimate.certificate.is_optimal else [NOT_CERTIFIED(gap=estimate.certificate.gap)]
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:
@@ -240,7 +234,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
             f"sigma_{unit}": sigma,
             f"target_{unit}": goal,
             f"by_axis_{unit}": tuple(axes.tolist()),
-            **WeakestMotion(MOTIONS[first + worst], float(sigmas[first + worst])).figures(),
+            "weakest": MOTIONS[first + worst],
         }
         yield kind(
             # A contradiction is judged by the check that found it; here it says how wrong the result may be.

@@ -21,7 +21,6 @@ from lce_rig.calibrate import (
     estimate_extrinsics,
 )
 from lce_rig.calibrate.findings import UNDETERMINED
-from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.result import capture_residual, error_to_reference, squares_scale
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
@@ -475,7 +474,6 @@ def _judged(
         ),
         scene_share=own.share,
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
-        weakest=find_weakest(validation.cov, estimate.lever_m),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,

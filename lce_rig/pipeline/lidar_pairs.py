@@ -13,7 +13,6 @@ import numpy as np
 
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings
 from lce_rig.calibrate.between_lidars import close_loops, estimate_between_lidars
-from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError
@@ -160,7 +159,6 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
         diagnostics=estimate.diagnostics,
         method=estimate.method,
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
-        weakest=find_weakest(validation.cov, estimate.lever_m),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations={name: _seen_from(invert(T_view), o) for name, o in estimate.observations.items()},

@@ -144,7 +144,7 @@ def large_table(n_rows: int) -> Any:
 
     rng = np.random.default_rng(0)
     n_kinds = 1000
-    codes = ("verdict.rotation_uncertain", "verdict.translation_uncertain", "verdict.largest_cause")
+    codes = ("verdict.rotation_uncertain", "verdict.translation_uncertain", "verdict.may_be_off")
     rows = [
         {
             "rig": "rlfs", "camera": "cam", "lidar": "lidar", "program": "lce-rig 0.1.0", "method": "paper",
@@ -205,7 +205,7 @@ def bench_table(folder: Path) -> None:
     for where in (
         "verdict = 'fail' and date > '2025-10-01'",
         "robot = 'r0017'",
-        "list_contains(findings, 'verdict.largest_cause') and sigma_rotation_deg > 0.999",
+        "list_contains(findings, 'verdict.may_be_off') and sigma_rotation_deg > 0.999",
     ):
         words = (
             "table",

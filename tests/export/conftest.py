@@ -37,7 +37,6 @@ _UNCERTAIN = {
     "target_deg": 0.2,
     "by_axis_deg": (0.1, 0.2, 0.2),
     "weakest": "rotation_x",
-    "weakest_sigma_deg": 0.2,
 }
 
 

@@ -36,7 +36,7 @@ def row():
             "camera": "cam",
             "lidar": "lidar",
             "verdict": "pass",
-            "findings": ["verdict.largest_cause"],
+            "findings": ["verdict.may_be_off"],
             "severities": ["note"],
             "T_cam_lidar": np.eye(4).ravel().tolist(),
             "cov": [float(k) for k in range(21)],

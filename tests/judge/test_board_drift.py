@@ -64,7 +64,7 @@ def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
 def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float, state: State) -> None:
     calibration = deployed(np.zeros(6))
     scene = axes({"rotation_z": ("changed", 0.54)})
-    drift = Drift(scene, (), T_FORWARD, T_FORWARD, None, {}, 15, 4000)
+    drift = Drift(scene, (), T_FORWARD, {}, 15, 4000)
     joint = JointDrift(np.zeros(6), np.diag(SIGMAS**2), 2.5)
     boards = BoardDrift(
         axes({"rotation_z": ("unchanged", board_deg)}), Metrics(0.01, 0.01, 0.1), 15, 15, joint

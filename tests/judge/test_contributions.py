@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import fit_extrinsic
 from lce_rig.core.geometry import difference, sigma_sizes
-from lce_rig.judge.contributions import summed_covariance, uncertainty_notes
+from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.validate import validate
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, simulate
@@ -67,16 +67,3 @@ def test_a_wrong_profile_leaves_the_error_within_the_claim(lens, board, expected
     sigma_deg, sigma_m = sigma_sizes(examination.cov)
     assert np.degrees(np.linalg.norm(error[3:])) < 2.5 * sigma_deg
     assert np.linalg.norm(error[:3]) < 2.5 * sigma_m
-
-
-def test_the_largest_cause_is_named_with_its_share_and_how_to_measure_it(sound):
-    _, examination = sound
-    note, *_ = uncertainty_notes(examination.contributions, RIG.calibration)
-    assert note.severity == "note"
-    unit = "deg" if "sigma_deg" in note.figures else "m"
-    assert note.figure("share") == pytest.approx(
-        (note.figure(f"sigma_{unit}") / note.figure(f"total_{unit}")) ** 2
-    )
-    size = "sigma_rotation_deg" if unit == "deg" else "sigma_translation_m"
-    largest = max(examination.contributions, key=lambda each: getattr(each, size))
-    assert note.figures["source"] == largest.source

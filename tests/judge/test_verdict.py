@@ -67,10 +67,6 @@ def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
     [
         ({"certificate": Certificate(False, 0.3)}, "fail", "verdict.not_certified", {"gap": 0.3}),
         (
-            {"certificate": Certificate(False, float("inf")), "method": "other"},
-            *("marginal", "verdict.no_certificate", {"method": "other"}),
-        ),
-        (
             {"diagnostics": {"fit_plane_rms_m": 0.025}},
             *("marginal", "verdict.planes_apart", {"rms_m": 0.025}),
         ),

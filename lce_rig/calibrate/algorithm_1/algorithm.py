@@ -19,15 +19,17 @@ from lce_rig.calibrate.algorithm_1.registration import (
     eliminate_linear,
     linear_unknowns,
     rotation_from_directions,
+    vec_rotation,
+    with_one,
 )
-from lce_rig.calibrate.findings import OUTLIER
-from lce_rig.calibrate.observability import require_observable
+from lce_rig.calibrate.findings import OUTLIER, UNDETERMINED
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, CaptureFeatures, extract_features
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.result import Start
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import Certificate, Diagnostics
+from lce_rig.core.calibration import MOTIONS, Certificate, Diagnostics
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Observation
@@ -44,6 +46,10 @@ _MAX_SHARE = 0.25
 # More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
+# Standard deviation of one capture's board plane between camera and LiDAR.
+_PLANE_SIGMA_M = 0.005
+# A motion that moves the board by more than this without changing the planes counts as undetermined.
+_MAX_WEAK_SIGMA_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +160,40 @@ def solve_planes(
     T_cam_lidar = pose(R[0], linear_unknowns(L, R)[0, :3])
     require_observable(features, problem, T_cam_lidar)
     return problem, T_cam_lidar
+
+
+def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
+    """Check that the boards' planes alone determine all six directions.
+
+    Edges could replace planes, but a set that requires this is fragile, as edge errors are systematic.
+
+    Args:
+        features: of the captures in `problem`.
+        problem: their moments.
+        T_cam_lidar: (4, 4) estimate.
+
+    Raises:
+        NotEnoughDataError: a direction is undetermined; it is named.
+    """
+    x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(1)]))
+    planes = Weights(PLANE_FREEDOMS / _PLANE_SIGMA_M**2, 0.0)
+    hessians = problem.quadratics(x, problem.associate(x[None])[0], weights=planes).hessians
+    lever_m = float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
+    scale = np.r_[np.ones(3), np.full(3, lever_m)]
+    information = hessians.sum(axis=0)[:6, :6] / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(information)
+    weak = values < 1 / _MAX_WEAK_SIGMA_M**2
+    if not weak.any():
+        return
+    # Unit vectors about one direction do not vary along it: the smaller of the two lateral spreads counts.
+    spread = np.linalg.eigvalsh(np.cov(np.array([f.normal for f in features]).T, bias=True))[1]
+    finding = UNDETERMINED(
+        # Of each weak direction its main component; translations and rotations are in comparable units.
+        motions=tuple(dict.fromkeys(MOTIONS[k] for k in np.argmax(np.abs(vectors[:, weak]), axis=0))),
+        n_captures=len(features),
+        spread_deg=float(np.degrees(np.sqrt(max(spread, 0.0)))),
+    )
+    raise NotEnoughDataError.of(finding)
 
 
 def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> list[NDArray[np.bool_]]:

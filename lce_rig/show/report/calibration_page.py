@@ -26,7 +26,7 @@ from lce_rig.core.phrasing import as_line, significant, sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
-from lce_rig.judge.findings import advice_of, cause_words, consequences, weakest_words
+from lce_rig.judge.findings import advice_of, cause_words, consequences
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.page import as_markup, render, style
@@ -134,7 +134,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
             for p in c.uncertainty
         ],
         "axes": [*_axis_rows(c.cov[3:, 3:], "deg", "about"), *_axis_rows(c.cov[:3, :3], "mm", "along")],
-        "weakest": "" if c.weakest is None else weakest_words(c.weakest),
         "causes": [
             (
                 cause_words(cause.source),
