@@ -15,11 +15,11 @@ from lce_rig.collect.findings import IMAGE_NONE
 from lce_rig.collect.gates import stillness_window_s
 from lce_rig.collect.live.guide import predict
 from lce_rig.collect.offline import CollectOptions
+from lce_rig.collect.offline import collect as collect_into
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import SourceOptions
-from lce_rig.pipeline.collect_recordings import fill_session
 from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
@@ -174,8 +174,9 @@ def collect(
     )
     sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
-    with show.progress_bar("collecting") as progress:
-        report = fill_session(rig, recordings, session, CollectOptions(target=n_wanted), progress)
+    options = CollectOptions(target=n_wanted)
+    with show.progress_bar("collecting") as progress, Session.resume(session, rig) as writer:
+        report = collect_into(writer, recordings, options, lambda done, total, _: progress(done, total))
     _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, FolderRecording) for recording in recordings):

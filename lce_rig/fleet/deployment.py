@@ -195,7 +195,15 @@ def deploy(
             forced = sorted({finding.code for finding in planned.objections})
             record = record.model_copy(update={"reason": reason, "forced": forced})
         try:
-            _write(place, record, Path(folder))
+            content, back = record.line().encode(), Path(folder) / "back"
+            place.must_run(STAGE, record.name, content=content)
+            place.put(Path(folder) / "new", f"releases/{record.name}")
+            wrong = fetch(place, record, back)
+            if wrong or (back / RECORD).read_bytes() != content:
+                raise TargetError(
+                    f"{place.label}: files read back differently: {differences_in_words(wrong) or RECORD}",
+                    "Check the disk there.",
+                )
             _commit(place, target, record, record.replaces, "deploy")
         except TargetError:
             # Free the space, and the name; after a lost connection, the next deployment does.
@@ -334,18 +342,6 @@ def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
     with suppress(LceRigError):
         return {(c.camera, c.lidar): c.T_cam_lidar for c in read_result(folder / RESULT).pairs}
     return {}
-
-
-def _write(place: Place, record: ReleaseRecord, folder: Path) -> None:
-    """Copy the new files into a release and read them back."""
-    place.must_run(STAGE, record.name, content=record.line().encode())
-    place.put(folder / "new", f"releases/{record.name}")
-    wrong = fetch(place, record, folder / "back")
-    if wrong or (folder / "back" / RECORD).read_bytes() != record.line().encode():
-        raise TargetError(
-            f"{place.label}: files read back differently: {differences_in_words(wrong) or RECORD}",
-            "Check the disk there.",
-        )
 
 
 def _commit(

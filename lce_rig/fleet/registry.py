@@ -172,7 +172,8 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
         ) from error
     if table.column_names != names:
         raise SessionError(
-            f"{source} lacks columns of this version", "Write it again: `lce-rig fleet table --rebuild`."
+            f"{source} lacks columns of this version",
+            "Write it again: `lce-rig fleet table --registry FOLDER --rebuild`.",
         )
     return table.cast(pa.schema([SCHEMA.field(name) for name in names]))
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.offline import CollectOptions, CollectReport, collect
+from lce_rig.collect.offline import CollectOptions, collect
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress, silent
@@ -55,7 +55,8 @@ def collect_from(
     for source, how in zip(given, by_path, strict=True):
         part = replace(how, is_part=len(given) > 1)
         opened += open_recordings([Path(source)], rig, part) if isinstance(source, str | Path) else [source]
-    report = fill_session(rig, opened, session, options, progress)
+    with Session.resume(session, rig) as writer:
+        report = collect(writer, opened, options, lambda done, total, _message: progress(done, total))
     if report.errors:
         raise report.errors[0]
     filled = Session.open(session)
@@ -67,27 +68,3 @@ def collect_from(
         causes = "\n".join(f"{n} x {why.text}" for why, n in refused.counts()[:3])
         raise NotEnoughDataError(f"{session}: no capture could be made", causes)
     return filled
-
-
-def fill_session(
-    rig: Rig,
-    recordings: Sequence[Recording],
-    session: Path | str,
-    options: CollectOptions | None = None,
-    progress: Progress = silent,
-) -> CollectReport:
-    """Add recordings to the session in a folder, or start one there.
-
-    Args:
-        rig: the profile.
-        recordings: open; see `collect_from`.
-        session: its folder.
-        options: what becomes a capture.
-        progress: called with (done, total) samples.
-
-    Raises:
-        SourceError: nothing could be read.
-        SessionError: the folder is not a session, or cannot be written.
-    """
-    with Session.resume(session, rig) as writer:
-        return collect(writer, recordings, options, lambda done, total, _message: progress(done, total))

@@ -33,7 +33,7 @@ from lce_rig.scene.findings import (
 )
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
-from lce_rig.show.overlays.canvas import write_picture
+from lce_rig.show.overlays.canvas import accumulated, write_picture
 from lce_rig.show.overlays.overlay import draw_edges
 from lce_rig.timing.scan_pairing import event_channel, rig_time_ns
 
@@ -239,11 +239,7 @@ class PairJudge:
             view = max(whole, key=lambda each: len(each.edges))
             image = next(seen.image for seen in kept if seen.name == view.capture)
             if isinstance(image, Events):
-                # The number of events of each pixel, dark on white.
-                counts = np.zeros((image.height_px, image.width_px))
-                np.add.at(counts, (image.y, image.x), 1.0)
-                grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
-                image = Image(image.sensor, "events", None, grey)
+                image = Image(image.sensor, "events", None, accumulated(image))
             example = view.capture, image, view
         return PairDrift(c, judged, self._boards(c, boards), example)
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array
 from lce_rig.session.durable import write_atomically
@@ -60,6 +61,13 @@ def fitted(picture: Picture, width_px: int, height_px: int, colour: Colour = PAN
 def panel(width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
     """Make a plain image."""
     return np.full((height_px, width_px, 3), colour, dtype=np.uint8)
+
+
+def accumulated(events: Events) -> Picture:
+    """Draw the number of events of each pixel (H, W), dark on white."""
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (events.y, events.x), 1.0)
+    return np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
 
 
 def turbo(values: Array, low: float, high: float) -> NDArray[np.uint8]:

@@ -19,7 +19,6 @@ from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Events
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import as_line, significant, sizes
@@ -29,6 +28,7 @@ from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import advice_of, cause_words, consequences
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
+from lce_rig.show.overlays.canvas import accumulated
 from lce_rig.show.page import as_markup, render, style
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
@@ -359,7 +359,10 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
             if capture.has_image(c.camera, channel):
                 return data_uri(capture.image(c.camera, channel).pixels, outline)
         if c.camera in capture.event_cameras:
-            return data_uri(_accumulated(capture.events(c.camera), stamp_ns), outline)
+            events = capture.events(c.camera)
+            middle_ns = stamp_ns or (int(events.t_ns[-1]) if len(events) else 0) - _EVENTS_NS // 2
+            near = events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
+            return data_uri(accumulated(near), outline)
     return ""
 
 
@@ -386,16 +389,6 @@ def data_uri(pixels: NDArray[np.uint8], outline: Array) -> str:
         cv2.polylines(drawn, [points], True, _OUTLINE_BGR, 2, cv2.LINE_AA, 4)
     content = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
     return "data:image/jpeg;base64," + base64.b64encode(content).decode()
-
-
-def _accumulated(events: Events, stamp_ns: int | None) -> NDArray[np.uint8]:
-    """Draw the events about a time, or the last ones, bright on dark."""
-    end_ns = int(events.t_ns[-1]) if len(events) else 0
-    middle_ns = end_ns - _EVENTS_NS // 2 if stamp_ns is None else stamp_ns
-    near = events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
-    counts = np.zeros((events.height_px, events.width_px))
-    np.add.at(counts, (near.y, near.x), 1.0)
-    return np.asarray(np.clip(40 + 70 * counts, 0, 255), dtype=np.uint8)
 
 
 def worst_first(planes_m: Sequence[float], edges_m: Sequence[float]) -> list[tuple[int, float]]:
