@@ -360,8 +360,9 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
                 return data_uri(capture.image(c.camera, channel).pixels, outline)
         if c.camera in capture.event_cameras:
             events = capture.events(c.camera)
-            middle_ns = stamp_ns or (int(events.t_ns[-1]) if len(events) else 0) - _EVENTS_NS // 2
-            near = events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
+            if stamp_ns is None:  # the last ones
+                stamp_ns = (int(events.t_ns[-1]) if len(events) else 0) - _EVENTS_NS // 2
+            near = events.between(stamp_ns - _EVENTS_NS // 2, stamp_ns + _EVENTS_NS // 2)
             return data_uri(accumulated(near), outline)
     return ""
 
