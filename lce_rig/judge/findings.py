@@ -36,7 +36,8 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.laser_angles": _OF_POSES.split(),
     "verdict.lens_model": f"{_OF_POSES}verdict.intrinsics verdict.pattern_offset".split(),
     "verdict.intrinsics": (
-        f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
+        f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ "
+        "verdict.planes_apart verdict.sensors_disagree verdict.few_used".split()
     ),
     "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
     "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.planes_apart".split(),

@@ -15,6 +15,7 @@ from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
+    CHANGED,
     CHANNELS_DIFFER,
     EDGE_RESIDUAL,
     FAR_FROM_NOMINAL,
@@ -72,6 +73,7 @@ def judge(
     n_captures: int,
     others: Sequence[Finding] = (),
     T_view: Array | None = None,
+    n_misfits: int = 0,
 ) -> tuple[Verdict, tuple[Finding, ...]]:
     """Judge extrinsics by all checks.
 
@@ -84,6 +86,7 @@ def judge(
         n_captures: number of captures, including those without a board.
         others: of other evidence: contradictions between cameras, what the scene did to the result.
         T_view: (4, 4) from the frame of the nominal extrinsic to that of the estimate; None for the same.
+        n_misfits: images whose corners fit no pose of the board. A wrong lens causes them.
 
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
@@ -107,16 +110,32 @@ def judge(
         *_precision(estimate, examination, rig),
     ]
     is_weighed = estimate.method == "ml" and estimate.lens is not None
-    return _verdict(_blame_lens(_weigh_scale(findings, is_weighed)), examination.cov)
+    is_misfit = 2 * n_misfits >= len(estimate.used)
+    return _verdict(_blame_lens(_weigh_scale(findings, is_weighed), is_misfit), examination.cov)
 
 
-def _blame_lens(findings: Sequence[Finding]) -> list[Finding]:
-    """Make contradicted intrinsics the cause of boards at two places that differ, unless squares are it."""
-    errors = {f.code for f in findings if f.severity == "error"}
-    if SHARES_DIFFER.code not in errors or SCALE_OFF.code in errors:
+def _blame_lens(findings: Sequence[Finding], is_misfit: bool) -> list[Finding]:
+    """Make contradicted intrinsics the cause of boards at two places that differ, unless squares are it.
+
+    Captures that fit another mounting are a note beside intrinsics that fit few images.
+
+    Args:
+        findings: against extrinsics.
+        is_misfit: whether corners fit no pose of the board in many images.
+    """
+    blamed = [f for f in findings if f.code == INTRINSICS.code and (is_misfit or f.severity == "warning")]
+    if not blamed:
         return list(findings)
-    is_blamed = [f.code == INTRINSICS.code and f.severity == "warning" for f in findings]
-    return [replace(f, severity="error") if own else f for f, own in zip(findings, is_blamed, strict=True)]
+    errors = {f.code for f in findings if f.severity == "error"}
+    of_motion = {MOVED.code, CHANGED.code} if is_misfit else set()
+    is_cause = bool(errors & of_motion) or (SHARES_DIFFER.code in errors and SCALE_OFF.code not in errors)
+
+    def severity_of(f: Finding) -> Severity:
+        if f in blamed and is_cause:
+            return "error"
+        return "note" if f.code in of_motion else f.severity
+
+    return [replace(f, severity=severity_of(f)) for f in findings]
 
 
 def _weigh_scale(findings: Sequence[Finding], is_weighed: bool) -> list[Finding]:

@@ -32,6 +32,7 @@ from lce_rig.core.geometry import Array, invert, relative_pose, sigma_sizes, tan
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
+from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.export.extrinsics import Reference
 from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.findings import lacks_captures
@@ -424,7 +425,10 @@ def _judged(
     if own.share is not None:
         others += share_findings(own.share)
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, validation, rig, own.camera, own.lidar, n_captures, others)
+    n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())
+    verdict, findings = judge(
+        estimate, validation, rig, own.camera, own.lidar, n_captures, others, n_misfits=n_misfits
+    )
     used = estimate.captures_of(estimate.used)
     refused = dict(own.refused)
     for name, why in estimate.refused.items():

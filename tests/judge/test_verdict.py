@@ -21,7 +21,7 @@ from lce_rig.judge.findings import (
     by_cause,
     consequences,
 )
-from lce_rig.judge.split_consistency import Contrast
+from lce_rig.judge.split_consistency import Contrast, RejectedGroup
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import distance_findings, judge, plate_findings
 from lce_rig.lens.models import LensPrior
@@ -219,6 +219,23 @@ def test_what_follows_from_a_cause_stands_below_it():
     listed = by_cause([note, plane, shares, scale, certificate])
     assert listed == (certificate, scale, plane, shares, note)
     assert consequences(listed) == {"verdict.plane_residual": scale.code, "verdict.shares_differ": scale.code}
+
+
+@pytest.mark.parametrize(
+    ("n_misfits", "first", "moved"), [(0, "verdict.moved", "error"), (12, "verdict.intrinsics", "note")]
+)
+def test_intrinsics_that_fit_few_images_come_before_captures_of_another_mounting(
+    estimate, n_misfits, first, moved
+):
+    turned = np.r_[np.zeros(3), np.radians(3.0), 0, 0]
+    rejected = RejectedGroup(("000018", "000019"), "last", "000017")
+    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1, is_visible=True)
+    examination = replace(
+        examined(estimate), contrasts=(Contrast("before", "after", turned, 0.0, 2, rejected=rejected),)
+    )
+    verdict, findings = judge(estimate, examination, RIG, "cam", "lidar", 20, [lens], None, n_misfits)
+    assert (verdict, findings[0].code) == ("fail", first)
+    assert [f.severity for f in findings if f.code == "verdict.moved"] == [moved]
 
 
 def test_intrinsics_that_boards_contradict_are_the_cause_of_boards_that_differ_by_their_place(estimate):
