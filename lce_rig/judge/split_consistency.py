@@ -266,11 +266,13 @@ def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, 
     shares = groups / groups.sum(axis=1, keepdims=True)
     sight = centres.mean(axis=0) / np.linalg.norm(centres.mean(axis=0))
     boards = _Turns(shares @ turns[0], 1 / (shares @ turns[1] ** 2), sight)
-    return boards.groups(groups), boards.change(np.argmax(groups > 0, axis=1))
+    # Captures of one placement have one error, but each may be an outlier.
+    captures = _Turns(turns[0], shares.sum(axis=0) / turns[1] ** 2, sight)
+    return boards.groups(groups), captures.change()
 
 
 class _Turns(NamedTuple):
-    """Boards of n placements turned about their lines of sight.
+    """Boards of n placements or captures turned about their lines of sight.
 
     Attributes:
         angles: (n,) rad.
@@ -295,11 +297,11 @@ class _Turns(NamedTuple):
         apart, _ = self._compare(smaller, rest)
         return Contrast("group", "rest", apart, chance, len(members), members, is_noise_known=True)
 
-    def change(self, starts: NDArray[np.intp]) -> Contrast:
-        """Compare boards before and after the largest change, with the first capture (n,) of each."""
+    def change(self) -> Contrast:
+        """Compare captures before and after the largest change."""
         from scipy.special import chdtrc
 
-        order = np.argsort(starts)
+        order = np.arange(len(self.angles))
         cut, fall = self._divide(order, _MIN_END)
         smaller, rest = sorted((order[:cut], order[cut:]), key=len)
         # Beside an outlier, the others of its side agree with the rest.
@@ -308,7 +310,7 @@ class _Turns(NamedTuple):
         n_tried = len(order) + 1 - 2 * _MIN_END
         chance = min(n_tried * float(chdtrc(1, fall)), 1.0) if is_change else 1.0
         apart, _ = self._compare(order[:cut], order[cut:])
-        return Contrast("before", "after", apart, chance, int(starts[order[cut]]), is_noise_known=True)
+        return Contrast("before", "after", apart, chance, cut, is_noise_known=True)
 
     def _divide(self, order: NDArray[np.intp], least: int) -> tuple[int, float]:
         """Divide boards in an order where the weighted sum of squares falls most.
