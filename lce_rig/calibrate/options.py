@@ -1,15 +1,62 @@
 """Options of a calibration, and what a profile says of the LiDAR, the lens and the board."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.session_lens import SessionLens
-from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.geometry import Array
-from lce_rig.rig import LidarIntrinsicsSettings, LidarSettings
+from lce_rig.lens.models import LensPrior
+from lce_rig.rig import BoardSettings, CameraSettings, LidarIntrinsicsSettings, LidarSettings
+
+Source = Literal["intrinsics", "square_size", "pattern_offset", "plate_size", "board_bow"]
+
+# As a fraction of a square, where a profile states none: two millimetres in a metre.
+_SQUARE = 2e-3
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Standard deviations of a profile's lens and board.
+
+    Attributes:
+        lens: the intrinsics with theirs.
+        square_size: relative.
+        pattern_offset_m: of each coordinate of the pattern's centre on the plate.
+        plate_m: of each side of the plate.
+        bow_m: of the middle's height over the ends, along the width and along the height.
+    """
+
+    lens: LensPrior
+    square_size: float
+    pattern_offset_m: float
+    plate_m: float
+    bow_m: float
+
+    @classmethod
+    def of(cls, camera: CameraSettings, board: BoardSettings) -> "Tolerances":
+        """Read a profile's camera and board; defaults take the place of what it leaves out."""
+        squares_m = _SQUARE * board.square_m if board.square_sigma_m is None else board.square_sigma_m
+        return cls(
+            lens=LensPrior.read(camera, board),
+            square_size=squares_m / board.square_m,
+            pattern_offset_m=board.pattern_offset_sigma_m,
+            plate_m=board.plate_sigma_m,
+            bow_m=board.bow_sigma_m,
+        )
+
+    def sigma(self, source: Source) -> float:
+        """Return the standard deviation of a source, in its own unit; errors of a lens have unit size."""
+        return {
+            "intrinsics": 1.0,
+            "square_size": self.square_size,
+            "pattern_offset": self.pattern_offset_m,
+            "plate_size": self.plate_m,
+            "board_bow": self.bow_m,
+        }[source]
 
 
 @dataclass(frozen=True)

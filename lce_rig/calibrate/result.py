@@ -9,12 +9,32 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import ends_on_board, extract_features, plane_residuals
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.session_lens import SessionLens
-from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, PoseDifference, rotation_angle, sigma_sizes
 from lce_rig.core.results import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """How far an error of the profile moves the extrinsics, as they are used with the result's intrinsics.
+
+    Or the moves that would resolve what a check contradicts: the covariance holds both sides.
+
+    Attributes:
+        source: what is wrong, or the check.
+        sigma: its standard deviation, in its own unit.
+        moves: (n, 6) tangents (translation m, rotation rad) per unit, of n independent errors of that size.
+    """
+
+    source: str
+    sigma: float
+    moves: Array
+
+    def covariance(self) -> Array:
+        """Compute the covariance (6, 6) for the source's standard deviation."""
+        return np.asarray(self.sigma**2 * self.moves.T @ self.moves)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,14 +13,15 @@ from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
-from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
 from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
-from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
-from lce_rig.calibrate.tolerances import PoseErrors, Sensitivity, Source, Tolerances, pose_errors
+from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
+from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.results import Observation
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
@@ -63,6 +64,42 @@ def by_scatter(
         turns=_turns(joint),
         lens=settings.lens,
     )
+
+
+class PoseErrors(NamedTuple):
+    """Independent errors of lens or pattern, and what they do to the boards' poses in the images.
+
+    Attributes:
+        source: what is wrong.
+        moves: (n, F, 6) tangents by which T_cam_board of each capture moves per unit of each error.
+        turns: (n, 3) rotations of the camera that project like it, as the intrinsics have the same error.
+    """
+
+    source: Source
+    moves: Array
+    turns: Array
+
+
+def pose_errors(
+    observations: Sequence[Observation], board: Board, lens: SessionLens | None
+) -> list[PoseErrors]:
+    """List errors of lens and pattern with their effects on the poses in the images.
+
+    Args:
+        observations: F captures.
+        board: as the profile says.
+        lens: of the session; None leaves its errors out.
+    """
+    poses = np.array([observation.image.T_cam_board for observation in observations])
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
+    farther, beside = t + R @ [*board.pattern_offset_m, 0.0], -np.moveaxis(R[:, :, :2], 2, 0)
+    errors = [] if lens is None else [PoseErrors("intrinsics", lens.moves(observations), lens.turns)]
+    of_pattern: dict[Source, Array] = {"square_size": farther[None], "pattern_offset": beside}
+    for source, shifts in of_pattern.items():
+        moves = np.concatenate([shifts, np.zeros_like(shifts)], axis=2)
+        errors.append(PoseErrors(source, moves, np.zeros((len(moves), 3))))
+    return errors
 
 
 class ScanMoves(NamedTuple):

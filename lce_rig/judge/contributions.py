@@ -13,8 +13,8 @@ from typing import get_args
 
 import numpy as np
 
-from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.calibrate.tolerances import Sensitivity, Source
+from lce_rig.calibrate.options import Source
+from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
 from lce_rig.core.calibration import Contribution, Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.judge.split_consistency import Contrast, objections

@@ -26,13 +26,12 @@ from lce_rig.judge.contributions import (
     list_contributions,
     summed_covariance,
 )
-from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
-from lce_rig.judge.laser_angles import estimate_angles
-from lce_rig.judge.lens_model import model_findings
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, model_findings
 from lce_rig.judge.local_quadratic import (
     OF_PROFILE,
     SCALE,
     capture_costs,
+    estimate_angles,
     expand,
     feature_sigmas,
     pattern_of,

@@ -46,7 +46,7 @@ from lce_rig.judge.findings import (
     verdict_of,
 )
 from lce_rig.judge.intrinsics_check import lens_findings
-from lce_rig.judge.laser_angles import angle_findings
+from lce_rig.judge.local_quadratic import angle_findings
 from lce_rig.judge.split_consistency import split_findings
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig

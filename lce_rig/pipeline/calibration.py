@@ -21,9 +21,9 @@ from lce_rig.calibrate import (
     estimate_extrinsics,
 )
 from lce_rig.calibrate.findings import UNDETERMINED
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.result import capture_residual, error_to_reference, squares_scale
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
-from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages

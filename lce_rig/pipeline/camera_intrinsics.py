@@ -31,8 +31,13 @@ from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.export.ros_files import camera_info_text
 from lce_rig.judge.findings import verdict_of
-from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
-from lce_rig.judge.lens_model import model_findings
+from lce_rig.judge.intrinsics_check import (
+    IntrinsicsCheck,
+    compare_with_given,
+    judge_lens,
+    lens_findings,
+    model_findings,
+)
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.still_sessions import StillSession, draw_corners
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.quadratics import symmetric_inverse
-from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform

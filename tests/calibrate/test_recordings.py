@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings, error_to_reference, fit_extrinsic
-from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.calibration import Method
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.files import decode_pcd

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.geometry import difference
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.detect.image.search import board_from_pose

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.geometry import difference, perturb, tangent_sizes
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand, pattern_of, scale_of
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, find_turned, split_findings

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.geometry import Array, fit_plane
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.judge.laser_angles import angle_findings, estimate_angles
+from lce_rig.judge.local_quadratic import angle_findings, estimate_angles
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 

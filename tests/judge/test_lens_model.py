@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from lce_rig.judge.lens_model import corner_noise, model_findings
+from lce_rig.judge.intrinsics_check import corner_noise, model_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.models import MODELS
 from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph

@@ -88,7 +88,7 @@ class Priors:
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of each camera's distances, from squares or focal length; one figure for all.
         scale_is_claimed: whether the covariance contains the error of the scale. It must not where the
-            effects of lens and squares are added to it (`tolerances`).
+            effects of lens and squares are added to it (`uncertainty`).
     """
 
     offset_m: float = 0.005
