@@ -23,10 +23,15 @@ from lce_rig.core.board import Board
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard
-from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
+from lce_rig.detect.events.figures import (
+    MEMORY_NS,
+    event_quality,
+    explain_missing_board,
+    outline_px,
+    too_fast,
+)
 from lce_rig.detect.events.windows import is_flickering
 from lce_rig.detect.findings import IMAGE_FLICKER, IMAGE_HARDLY_MOVED
-from lce_rig.detect.limits_met import explain_missing_board, too_fast
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 

@@ -5,19 +5,28 @@ All parts of the program detect boards here, live and offline, so that they agre
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
+from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.findings import (
+    IMAGE_NEAR_BORDER,
+    IMAGE_SMALL_SQUARES,
+    IMAGE_TILTED,
+    LIDAR_OTHER_SIZE,
+    LIDAR_RAGGED_EDGES,
+    LIDAR_TOO_FEW_POINTS,
+    TOO_NEAR_OR_FAR,
+)
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board
 from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
-from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
-from lce_rig.rig import Rig
+from lce_rig.rig import QualitySettings, Rig
 
 Boards = TypeVar("Boards", ImageBoard, list[LidarBoard])
 
@@ -160,3 +169,74 @@ class BoardFinder:
             return Search(found, found)
         boards = [replace(board, stamp_ns=scan.stamp_ns) for board in found]
         return Search(boards, gate_lidar_boards(boards, self.board, self.rig.quality))
+
+
+def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
+    """Compare a board detected in an image with the profile's limits.
+
+    Args:
+        sighting: one without quality is judged by its pose alone.
+        limits: `quality` of the rig profile.
+    """
+    q = sighting.quality
+    if q is not None and q.square_px < limits.min_square_px:
+        closer_m = sighting.distance_m * (1 - q.square_px / limits.min_square_px)
+        figures = {"square_px": q.square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
+        return IMAGE_SMALL_SQUARES.refusal(**figures)
+    if q is not None and q.border_px < limits.min_border_px:
+        return IMAGE_NEAR_BORDER.refusal(border_px=q.border_px, min_border_px=limits.min_border_px)
+    if sighting.tilt_deg > limits.max_tilt_deg:
+        turn_deg = sighting.tilt_deg - limits.max_tilt_deg + 5
+        figures = {"tilt_deg": sighting.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
+        return IMAGE_TILTED.refusal(**figures)
+    return _gate_distance("image", sighting.distance_m, limits) or sighting
+
+
+def gate_lidar_boards(
+    candidates: Sequence[LidarBoard], board: Board, limits: QualitySettings
+) -> list[LidarBoard] | Refusal:
+    """Keep the candidates within the profile's limits; refuse with the likeliest one's cause where none is.
+
+    Args:
+        candidates: boards of the scan, likeliest first, at least one.
+        board: the size wanted.
+        limits: `quality` of the rig profile.
+    """
+    refusals = [_lidar_problem(candidate, board, limits) for candidate in candidates]
+    kept = [candidate for candidate, refusal in zip(candidates, refusals, strict=True) if refusal is None]
+    return kept or refusals[0] or []
+
+
+def _lidar_problem(candidate: LidarBoard, board: Board, limits: QualitySettings) -> Refusal | None:
+    q = candidate.quality
+    if q.n_points < limits.min_points:
+        closer_m = max(0.1, q.distance_m * (1 - (q.n_points / limits.min_points) ** 0.5))
+        return LIDAR_TOO_FEW_POINTS.refusal(
+            n_points=q.n_points, min_points=limits.min_points, closer_m=closer_m
+        )
+    for side, wanted_m, measured_m, sigma_m in (
+        ("width", board.width_m, q.width_m, q.width_sigma_m),
+        ("height", board.height_m, q.height_m, q.height_sigma_m),
+    ):
+        excess = abs(measured_m - wanted_m) - 3 * sigma_m - limits.max_size_error * wanted_m
+        if excess > 0:
+            return LIDAR_OTHER_SIZE.refusal(
+                side=side, measured_m=measured_m, sigma_m=sigma_m, profile_m=wanted_m
+            )
+    if q.edge_rms_m > limits.max_edge_rms_m:
+        return LIDAR_RAGGED_EDGES.refusal(rms_m=q.edge_rms_m, max_rms_m=limits.max_edge_rms_m)
+    return _gate_distance("lidar", q.distance_m, limits)
+
+
+def _gate_distance(
+    stage: Literal["image", "lidar"], distance_m: float, limits: QualitySettings
+) -> Refusal | None:
+    """Refuse a board that is too near or too far."""
+    low_m, high_m = limits.min_distance_m, limits.max_distance_m
+    if distance_m < low_m:
+        figures = {"distance_m": distance_m, "min_distance_m": low_m, "move_m": low_m - distance_m + 0.05}
+        return TOO_NEAR_OR_FAR[stage][0].refusal(**figures)
+    if distance_m > high_m:
+        figures = {"distance_m": distance_m, "max_distance_m": high_m, "move_m": distance_m - high_m + 0.05}
+        return TOO_NEAR_OR_FAR[stage][1].refusal(**figures)
+    return None

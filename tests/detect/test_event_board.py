@@ -21,10 +21,10 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.results import ImageBoard
+from lce_rig.detect.events.figures import gate_event_board
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.detect.events.search import TRACK_NS, find_event_board
 from lce_rig.detect.image.search import find_image_board
-from lce_rig.detect.limits_met import gate_event_board
 from lce_rig.rig import QualitySettings
 
 MS = 1_000_000

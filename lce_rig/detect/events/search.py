@@ -12,10 +12,16 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
 from lce_rig.core.planar_pose import pose_covariance
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
+from lce_rig.detect.events.figures import (
+    event_quality,
+    explain_missing_board,
+    gate_event_board,
+    outline_px,
+    with_motion,
+)
 from lce_rig.detect.events.reconstructor import Reconstructor
+from lce_rig.detect.finder import gate_image_board
 from lce_rig.detect.image.search import find_image_board
-from lce_rig.detect.limits_met import explain_missing_board, gate_event_board, gate_image_board
 from lce_rig.rig import QualitySettings
 
 # One order of corners, and one of the two poses, for all images of the same board.
