@@ -361,15 +361,19 @@ def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, t
     parts = [ordered]
     if distance_m[-1] >= _FAR * distance_m[0]:
         parts = np.split(ordered, [int(np.argmax(gaps)) + 1])
-    return tuple(
-        (
-            len(part),
-            round(float(np.linalg.norm(part[:, :3, 3], axis=1).mean()), 1),
-            common_third(view.model.lens, part[:, :3, 3]),
-            _sides(view, part),
-        )
-        for part in parts
-    )
+    groups = []
+    for part in parts:
+        sides: dict[str, None] = {}
+        for T_cam_board in part:
+            held = describe_pose(view, T_cam_board)
+            leans = {"down": held.tilt_deg, "up": -held.tilt_deg}
+            leans |= {"right": held.turn_deg, "left": -held.turn_deg}
+            side = max(leans, key=lambda name: leans[name])
+            if leans[side] > LEANS_DEG:
+                sides[side] = None
+        mean_m = round(float(np.linalg.norm(part[:, :3, 3], axis=1).mean()), 1)
+        groups.append((len(part), mean_m, common_third(view.model.lens, part[:, :3, 3]), tuple(sides)))
+    return tuple(groups)
 
 
 def common_third(lens: Intrinsics, centres: Array) -> str:
@@ -386,16 +390,3 @@ def common_third(lens: Intrinsics, centres: Array) -> str:
         if share.max() < 1 / 3:
             return word
     return ""
-
-
-def _sides(view: SensorPlace, poses: Array) -> tuple[str, ...]:
-    """Name the tilts of boards, each once: where they face, as the person who holds them says it."""
-    sides: dict[str, None] = {}
-    for T_cam_board in poses:
-        held = describe_pose(view, T_cam_board)
-        leans = {"down": held.tilt_deg, "up": -held.tilt_deg}
-        leans |= {"right": held.turn_deg, "left": -held.turn_deg}
-        side = max(leans, key=lambda name: leans[name])
-        if leans[side] > LEANS_DEG:
-            sides[side] = None
-    return tuple(sides)

@@ -22,7 +22,7 @@ from lce_rig.detect.findings import (
 )
 from lce_rig.detect.lidar.measurement import Beam, build_board, refine
 from lce_rig.detect.lidar.plates import propose_plates, screen_plates
-from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan
+from lce_rig.detect.lidar.segments import OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import (
     Placement,
     PlaneView,
@@ -329,7 +329,13 @@ def look_for_board(
     at_once = _measure_at(scan, board, T_lidar_board, limits)
     if isinstance(at_once, LidarBoard) and _is_at(at_once, T_lidar_board):
         return at_once
-    nearby = scan.select(_near(scan, board, T_lidar_board))
+    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + MARGIN_M
+    rotation, centre = T_lidar_board[:3, :3].astype(np.float32), T_lidar_board[:3, 3].astype(np.float32)
+    # A sphere first: it is the cheaper test, and few returns pass it.
+    away = np.ascontiguousarray(scan.points.T) - centre[:, None]
+    with np.errstate(invalid="ignore", over="ignore"):
+        near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
+    nearby = scan.select(near[(np.abs(away[:, near].T @ rotation) <= half).all(axis=1)])
     found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if not isinstance(found, Refusal):
         distance_m = float(np.linalg.norm(T_lidar_board[:3, 3]))
@@ -360,16 +366,3 @@ def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
     """Return whether a board lies where a pose has it."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
     return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > LOOK_TURN
-
-
-def _near(scan: Scan, board: Board, T_lidar_board: Array) -> Indices:
-    """List the returns in a box about the board's place."""
-    T = T_lidar_board
-    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + MARGIN_M
-    rotation, centre = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-    # A sphere first: it is the cheaper test, and few returns pass it.
-    away = np.ascontiguousarray(scan.points.T) - centre[:, None]
-    with np.errstate(invalid="ignore", over="ignore"):
-        near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
-    is_inside = (np.abs(away[:, near].T @ rotation) <= half).all(axis=1)
-    return np.asarray(near[is_inside])

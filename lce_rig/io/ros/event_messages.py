@@ -142,11 +142,17 @@ class BagEvents(EventStream):
             SourceError: the bag cannot be read, or lacks the topic; the hint lists those that are there.
         """
         self._bag = bag or BagFile(path)
-        self._topic = topic or self._only_topic()
-        kind, n_messages = self._bag.topics.get(self._topic, ("", 0))
+        topics = self._bag.topics
+        fitting = sorted(name for name, (kind, n) in topics.items() if kind in EVENT_TYPES and n > 0)
+        if topic is None and len(fitting) != 1:
+            fault = f"events on {len(fitting)} topics" if fitting else "no topic with events"
+            hint = f"{list_topics(topics)}. Say which topic holds the camera's events."
+            raise SourceError(f"{path}: {fault}", hint)
+        self._topic = topic or fitting[0]
+        kind, n_messages = topics.get(self._topic, ("", 0))
         if kind not in EVENT_TYPES:
             fault = f"{topic} is {kind}, which holds no events" if kind else f"no topic {topic}"
-            raise SourceError(f"{path}: {fault}", list_topics(self._bag.topics))
+            raise SourceError(f"{path}: {fault}", list_topics(topics))
         self.notes = [f"{path.name}: events from {self._topic} ({n_messages} messages)"]
         self.resolution_px: tuple[int, int] | None = None
         for _, message in self._messages(self._topic, Losses()):
@@ -188,13 +194,3 @@ class BagEvents(EventStream):
             yield from enumerate(self._bag.messages({topic}))
         except SourceError as error:
             losses.add(findings.BAG_TORN(where=error.what))
-
-    def _only_topic(self) -> str:
-        """Name the only topic with events."""
-        topics = self._bag.topics
-        fitting = sorted(name for name, (kind, n) in topics.items() if kind in EVENT_TYPES and n > 0)
-        if len(fitting) != 1:
-            fault = f"events on {len(fitting)} topics" if fitting else "no topic with events"
-            hint = f"{list_topics(topics)}. Say which topic holds the camera's events."
-            raise SourceError(f"{self._bag.path}: {fault}", hint)
-        return fitting[0]
