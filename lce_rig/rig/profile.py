@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
@@ -152,6 +152,7 @@ class NominalExtrinsic(Settings):
     Attributes:
         quaternion_wxyz: unit quaternion of R, scalar first.
         rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+        matrix: the rows of R.
         translation_m: t, the LiDAR's origin in the optical frame.
         source: "cad", this rig's CAD model, with which the result must agree; or "typical", how such rigs are
             built: for guidance and simulation, and no test of a result.
@@ -163,6 +164,7 @@ class NominalExtrinsic(Settings):
     lidar: Name
     quaternion_wxyz: tuple[Figure, Figure, Figure, Figure] | None = None
     rpy_deg: Row | None = None
+    matrix: tuple[Row, Row, Row] | None = None
     translation_m: tuple[_Metres, _Metres, _Metres]
     source: Literal["cad", "typical"] = "cad"
     tolerance_deg: Positive = 5.0
@@ -170,12 +172,23 @@ class NominalExtrinsic(Settings):
 
     @model_validator(mode="after")
     def _is_a_pose(self) -> "NominalExtrinsic":
-        is_one = (self.quaternion_wxyz is None) != (self.rpy_deg is None)
-        require(is_one, "give the rotation as one of quaternion_wxyz, rpy_deg")
+        rotations = [
+            key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None
+        ]
+        names = " and ".join(rotations) if rotations else "none"
+        ways = "quaternion_wxyz, rpy_deg, matrix"
+        require(len(rotations) == 1, f"{names} given; give the rotation as one of {ways}")
         if self.quaternion_wxyz is not None:
             norm = float(np.linalg.norm(self.quaternion_wxyz))
             what = f"not a unit quaternion: its norm is {norm:.4g}"
             require(abs(norm - 1) <= _ROUNDING, what, "quaternion_wxyz")
+        if self.matrix is not None:
+            R = np.array(self.matrix)
+            error = float(np.abs(R @ R.T - np.eye(3)).max())
+            what = f"not a rotation: R R^T differs from the identity by {error:.3g}"
+            require(error <= 2 * _ROUNDING, what, "matrix")
+            what = "not a rotation but a mirroring: its determinant is -1"
+            require(np.linalg.det(R) > 0, what, "matrix")
         return self
 
     def to_matrix(self) -> Array:
@@ -184,8 +197,10 @@ class NominalExtrinsic(Settings):
 
         if self.quaternion_wxyz is not None:
             R = Rotation.from_quat(np.roll(self.quaternion_wxyz, -1)).as_matrix()
-        else:
+        elif self.rpy_deg is not None:
             R = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        else:
+            R = project_to_so3(np.array(self.matrix))
         return pose(R, np.array(self.translation_m))
 
 

@@ -21,7 +21,6 @@ import numpy as np
 from benchmarks.kept import kept_folder
 from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.export.writing import quaternion_wxyz
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.rig.profile import NominalExtrinsic
 from lce_rig.session import Session
@@ -166,7 +165,7 @@ def _simulate_pool(pool: tuple[Path, int, Nudge | None, int]) -> None:
     exact = NominalExtrinsic(
         camera="cam",
         lidar="lidar",
-        quaternion_wxyz=tuple(quaternion_wxyz(T[:3, :3]).tolist()),
+        matrix=tuple(map(tuple, T[:3, :3].tolist())),  # type: ignore[arg-type]
         translation_m=tuple(T[:3, 3].tolist()),
     )
     options = replace(options, mounting_seed=mounting, truth_rotation_deg=0.0, truth_translation_m=0.0)

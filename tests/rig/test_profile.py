@@ -124,23 +124,29 @@ def test_all_problems_are_listed_at_once_in_the_files_order():
     ] * 3
 
 
+def rows(R):
+    return str([[float(value) for value in row] for row in R])
+
+
 @settings(max_examples=10)
 @given(st.tuples(*[st.floats(-3, 3)] * 3))
-def test_a_nominal_rotation_is_read_as_written(phi):
+def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_rotvec(phi)
     wxyz = [float(value) for value in np.roll(rotation.as_quat(), 1)]
     head, tail = RLFS.split("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]")
-    entry = parse_rig(f"{head}quaternion_wxyz: {wxyz}{tail}").nominal("cam", "lidar")
-    np.testing.assert_allclose(entry.to_matrix()[:3, :3], exp_so3(np.array(phi)), atol=1e-9)
+    for text in (f"quaternion_wxyz: {wxyz}", f"matrix: {rows(rotation.as_matrix())}"):
+        entry = parse_rig(head + text + tail).nominal("cam", "lidar")
+        np.testing.assert_allclose(entry.to_matrix()[:3, :3], exp_so3(np.array(phi)), atol=1e-9)
 
 
 @pytest.mark.parametrize(
     "rotation",
     [
-        "quaternion_wxyz: [1, 0, 0, 0.2]",
-        "rpy_deg: [0, 0, 0]\n    quaternion_wxyz: [1, 0, 0, 0]",
+        "matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]",
+        "matrix: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]",
+        "rpy_deg: [0, 0, 0]\n    matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
         "tolerance_deg: 5.0",
     ],
 )

@@ -125,6 +125,6 @@ def test_a_lidar_nobody_can_simulate_is_named(rig):
 
 
 def test_a_rig_whose_lidar_cannot_see_what_the_camera_sees_is_refused():
-    ceiling = nominal("cam", rpy_deg=(0.0, 0.0, 90.0))
+    ceiling = nominal("cam", matrix=((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     with pytest.raises(LceRigError):
         next(simulate_captures(make_rig(nominal_extrinsics=(ceiling,)), n_captures=1, seed=0))
