@@ -10,8 +10,6 @@ from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
 from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments, stillness_window_s
 from lce_rig.collect.placement_dedupe import (
-    MIN_MOVE_M,
-    MIN_TURN_DEG,
     Placements,
     capture_poses,
     pose_figures,
@@ -47,15 +45,9 @@ class CollectOptions:
 
     Attributes:
         target: number of captures wanted: recordings are read until the session has as many; None for all.
-        min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
-            continuous recordings only.
-        max_motion_m: how far a board that stands still may move; None takes the profile's.
     """
 
     target: int | None = None
-    min_move_m: float = MIN_MOVE_M
-    min_turn_deg: float = MIN_TURN_DEG
-    max_motion_m: float | None = None
 
 
 @dataclass
@@ -176,8 +168,7 @@ class _Collector:
                 came before has been captured.
         """
         require_sensors(recording, has_cameras=bool(self._session.rig.cameras))
-        options = self._options
-        known = Placements(options.min_move_m, options.min_turn_deg)
+        known = Placements()
         # Where a capture of this recording was rejected, another moment of that placement is not wanted.
         unwanted = {name for key, name in self._names_by_key.items() if key.startswith(f"{recording.key}:")}
         rejected = [capture for name, capture in self._rejected.items() if name in unwanted]
@@ -211,8 +202,7 @@ class _Collector:
             cameras: cameras with events and without images.
             has_events: whether events are kept with captures, so that the board has to move.
         """
-        rig, options, losses = self._session.rig, self._options, self.report.counts
-        max_motion_m = rig.quality.max_motion_m if options.max_motion_m is None else options.max_motion_m
+        rig, losses = self._session.rig, self.report.counts
         samples = self._read(recording)
         if cameras:
             samples = with_event_pictures(samples, rig, cameras, losses)
@@ -223,10 +213,13 @@ class _Collector:
         if recording.n_samples >= _LONG_SAMPLES and rig.cameras:
             detections = sight_ahead(tracker, frames)
         gate: StillnessGate | MotionGate = StillnessGate(
-            rig.board.to_board(), max_motion_m, takes_singles=True, window_s=stillness_window_s(rig)
+            rig.board.to_board(),
+            rig.quality.max_motion_m,
+            takes_singles=True,
+            window_s=stillness_window_s(rig),
         )
         if has_events:
-            gate = MotionGate(rig, Placements(options.min_move_m, options.min_turn_deg), losses)
+            gate = MotionGate(rig, Placements(), losses)
         for moment in find_moments(detections, gate):
             confirmed = tracker.confirm(moment)
             if isinstance(confirmed, Refusal):

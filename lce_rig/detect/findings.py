@@ -188,11 +188,6 @@ IMAGE_HARDLY_MOVED = Kind(
     "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
     MOVE_SLOWLY,
 )
-IMAGE_STILL_SCENE = Kind(
-    "image.still_scene",
-    "the board hardly moved: {events_px:.1f} events/px in 1 s where most are (minimum {min_events_px:g})",
-    MOVE_SLOWLY,
-)
 IMAGE_TOO_FAST = Kind(
     "image.too_fast",
     "the board moved at {speed_mps:.2f} m/s during the scan (limit {max_speed_mps:g} m/s)",

@@ -80,9 +80,10 @@ def test_a_board_that_never_stands_still_is_never_captured(tmp_path, write_bag, 
     bag = write_bag(tmp_path / "a.bag", [0, 1, 2, 3] * 3)
     with Session.create(tmp_path / "s", rig) as session:
         assert collect(session, [open_recording(bag, rig)]).captured == []
-        # A hand never holds a board quite still: how much is still enough is an option.
-        loose = CollectOptions(max_motion_m=5.0)
-        assert collect(session, [open_recording(bag, rig)], loose).captured
+    # A hand never holds a board quite still: the profile says how much is still enough.
+    loose = changed(rig, quality__max_motion_m=5.0)
+    with Session.create(tmp_path / "loose", loose) as session:
+        assert collect(session, [open_recording(bag, loose)]).captured
 
 
 def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, write_bag, rig):

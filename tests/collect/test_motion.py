@@ -91,7 +91,7 @@ def test_a_board_that_comes_back_is_not_taken_twice(rles):
 def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rles):
     lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=60.0)
     unseen = Refusal("image.no_board")
-    for stream, code in [(lit, "image.flicker"), (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene")]:
+    for stream, code in [(lit, "image.flicker"), (event_stream([(-1.3, 3.0, 0.3)]), "image.hardly_moved")]:
         detections = watch(
             rles, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False
         )

@@ -99,7 +99,7 @@ def test_events_are_counted_on_the_board_only(stream, detection):
         (lambda s: s.between(0, 0), "image.no_events", {}),
         (lambda s: s.between(1_100 * MS, 1_400 * MS), "read.network_settling", {}),
         (lambda s: s.between(0, 700 * MS), "read.after_events", {"gap_s": pytest.approx(0.5, abs=1e-3)}),
-        (lambda _: noise(0.8), "image.still_scene", {}),
+        (lambda _: noise(0.8), "image.hardly_moved", {}),
         (lambda _: noise(0.005), "image.few_events", {}),
         (lambda _: join(noise(0.3), lamps(100)), "image.flicker", {}),
     ],

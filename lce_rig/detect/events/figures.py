@@ -21,7 +21,6 @@ from lce_rig.detect.findings import (
     IMAGE_HOT_PIXELS,
     IMAGE_NO_EVENTS,
     IMAGE_SMEARED,
-    IMAGE_STILL_SCENE,
     IMAGE_TOO_FAST,
     IMAGE_TURNING,
 )
@@ -238,5 +237,5 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
     events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
-        return IMAGE_STILL_SCENE.refusal(events_px=events_px, min_events_px=needed_px)
+        return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=needed_px)
     return seen
