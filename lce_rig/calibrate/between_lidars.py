@@ -20,7 +20,6 @@ boards decide T_12 without that turn, which then follows by capture.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -187,7 +186,12 @@ def estimate_between_lidars(
     """
     consensus = find_consensus(candidates, board)
     agreed, T_consensus = consensus.observations, consensus.T_cam_lidar
-    seen = [min(first[o.capture], key=partial(_apart_m, o.image.T_cam_board)) for o in agreed]
+    seen = []
+    for o in agreed:
+        apart_m = [
+            np.linalg.norm((each.T_lidar_board - o.image.T_cam_board)[:3, 3]) for each in first[o.capture]
+        ]
+        seen.append(first[o.capture][int(np.argmin(apart_m))])
     one = place_boards(seen, board, settings[0])
     other = place_boards([o.lidar for o in agreed], board, settings[1])
     turns = _turned_alike(one.T, T_consensus @ other.T, board)
@@ -276,10 +280,6 @@ def optical_frame(middles: Array) -> Array:
     forward = towards / length if length > 0 else np.array([1.0, 0.0, 0.0])
     down = np.array([0.0, 0.0, -1.0])
     return pose(np.stack([np.cross(down, forward), down, forward]), np.zeros(3))
-
-
-def _apart_m(T: Array, lidar: LidarBoard) -> float:
-    return float(np.linalg.norm(T[:3, 3] - lidar.T_lidar_board[:3, 3]))
 
 
 def _turned_alike(T: Array, other: Array, board: Board) -> Array:

@@ -92,8 +92,9 @@ def judge(
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
     board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
+    proof = estimate.certificate
     findings = [
-        *_certificate(estimate),
+        *([] if proof.is_optimal else [NOT_CERTIFIED(gap=proof.gap)]),
         *examination.lens_model,
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
@@ -224,10 +225,6 @@ def share_findings(share: SceneShare) -> list[Finding]:
             n_edges=share.n_edges,
         )
     ]
-
-
-def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
-    return [] if estimate.certificate.is_optimal else [NOT_CERTIFIED(gap=estimate.certificate.gap)]
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:

@@ -9,8 +9,8 @@ from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate.together import WIDENED, estimate_lidar
 from lce_rig.core.geometry import difference, exp_so3, pose
-from lce_rig.pipeline.measure_lidar import WIDENED, estimate_lidar
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 BIASED = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.003)
