@@ -223,8 +223,10 @@ def _sensor_settings(
         values += lens_settings(name, parse_intrinsics(text))
     if board is not None:
         stated = parent.board.model_dump(exclude_none=True, exclude_unset=True)
-        deviations = {key: value for key, value in stated.items() if key.endswith("sigma_m")}
-        values.append(("board", as_yaml(board_block(parse_board(board)) | deviations)))
+        plate = {"type": "checkerboard"} | board_block(parse_board(board))
+        foreign = [key for key in stated if key not in plate and not key.endswith("sigma_m")]
+        values += [(f"board.{key}", as_yaml(value)) for key, value in plate.items()]
+        values += [(f"board.{key}", "null") for key in foreign]
     return values
 
 
