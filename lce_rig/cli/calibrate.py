@@ -377,11 +377,9 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
 def _explanation(c: Calibration) -> Iterator[str]:
     """State residuals, certificate, channels, cameras, the scene, unused captures and notes."""
     held_out = f", held out {1000 * c.held_out_m:.1f} mm" if math.isfinite(c.held_out_m) else ""
-    certificate = f"none (method {c.method} has no certificate)"
-    if math.isfinite(c.certificate.gap):
-        certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
-        certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
-        certificate += f", gap {c.certificate.gap:.0e}"
+    certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
+    certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
+    certificate += f", gap {c.certificate.gap:.0e}"
     yield f"  detected     board found by both sensors in {c.n_detected}"
     yield f"  residuals    {residual_words(c.metrics, c, held_out)}"
     yield f"  certificate  {certificate}"

@@ -104,7 +104,7 @@ class Certificate:
 
     Attributes:
         is_optimal: whether the gap is below the tolerance.
-        gap: bound on (cost - global minimum) / cost; infinite where the method has none.
+        gap: bound on (cost - global minimum) / cost.
     """
 
     is_optimal: bool
