@@ -114,6 +114,8 @@ def test_an_advised_command_can_be_typed(place, command):
 # Without a recording `collect` has a simulated rig.
 PARSED_ONLY = {"doctor"}
 _VALUES = {
+    "--targets": "deploy.yaml",
+    "--robot": "kestrel",
     "--rig": "rig.yaml",
     "--from": "recording",
     "--save-profile": "new.yaml",
