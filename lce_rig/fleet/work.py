@@ -251,8 +251,12 @@ _DETAIL_BYTES = 2000
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )
-# OpenCV has an error of its own for it, C++ one that Python does not know.
-_WITHOUT_MEMORY = ("MemoryError", "Insufficient memory", "bad_alloc")
+# OpenCV has an error of its own for it, C++ one that Python does not know; Rust (pydantic) and the C library
+# end the process with a line.
+_WITHOUT_MEMORY = (
+    *("MemoryError", "Insufficient memory", "bad_alloc", "memory allocation of"),
+    *("out of memory", "cannot allocate memory", "Cannot allocate memory"),
+)
 
 
 class Ended(NamedTuple):

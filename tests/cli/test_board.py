@@ -99,4 +99,4 @@ def test_a_session_of_a_board_with_markers_covered_in_part_gives_its_truth(lce_r
     assert outcome.code == 6
     (pair,) = json.loads(outcome.out)["pairs"]
     codes = {each["refusal"]["code"] for each in pair["captures"].values()}
-    assert codes == {"image.misfit" if "tag_spacing" in text else "image.other_dictionary"}
+    assert codes == {"image.other_spacing" if "tag_spacing" in text else "image.other_dictionary"}
