@@ -26,8 +26,9 @@ def bench_speed() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         session = Path(scratch) / "session"
         SETS[0].collect(session)
-        for what, figure in (*_detector_speed(session), *_command_speed(session)):
-            print_row(what, figure)
+        for part in (_detector_speed, _command_speed, _search_without_rings):
+            for what, figure in part(session):
+                print_row(what, figure)
 
 
 def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
@@ -63,6 +64,20 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     start = time.process_time()
     fit_extrinsic(thirty, board, EstimateSettings("paper"))
     yield "Algorithm 1, N = 30, with certificate", f"{time.process_time() - start:.2f} s"
+
+
+def _search_without_rings(path: Path) -> Iterator[tuple[str, str]]:
+    from lce_rig.session import Session
+
+    simulated = path.with_name("mid360")
+    words = ["simulate", "--rig", "mid360", "--captures", "8", str(simulated)]
+    subprocess.run([sys.executable, "-m", "lce_rig", *words], check=True, capture_output=True)
+    session = Session.open(simulated)
+    scans = [capture.scan("lidar") for capture in session.captures]
+    yield (
+        f"board in a simulated Mid-360's point cloud of {len(scans[0].points)} points, median",
+        milliseconds(lambda k: BoardFinder(session.rig).scan(scans[k]), len(scans)),
+    )
 
 
 def milliseconds(work: Callable[[int], object], n: int = 18) -> str:

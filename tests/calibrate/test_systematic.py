@@ -76,6 +76,7 @@ def test_range_errors_of_known_size_are_in_the_covariance(n_seeds):
     assert 3.0 < nees.mean() < 7.5
 
 
+@pytest.mark.long
 def test_range_errors_of_which_nothing_is_known_are_not_in_the_covariance():
     assert normalised_errors(NO_DRAWS, 12).mean() > 12.0
 

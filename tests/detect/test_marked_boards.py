@@ -186,6 +186,7 @@ def test_the_side_of_a_square_is_measured_where_no_two_neighbours_are_visible():
     assert quality.square_px == pytest.approx(20.0)
 
 
+@pytest.mark.long
 def test_a_second_board_of_the_dictionary_is_refused_not_mixed_in():
     other = replace(CHARUCO, first_id=40)
     left, right = looking(10, 0, 0, (-0.45, 0, 1.8)), looking(10, 0, 0, (0.45, 0, 1.8))
