@@ -188,7 +188,7 @@ def largest_sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(sizes[0])), float(sizes[1])
 
 
-def chance_of(chi2: float, n_freedoms: int) -> float:
+def chance_of(chi2: float, n_freedoms: float) -> float:
     """Compute the probability that a chi-squared variable of `n_freedoms` exceeds `chi2`."""
     from scipy.special import chdtrc
 

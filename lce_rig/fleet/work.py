@@ -254,8 +254,13 @@ _ONE_THREAD = dict.fromkeys(
 # OpenCV has an error of its own for it, C++ one that Python does not know; Rust (pydantic) and the C library
 # end the process with a line.
 _WITHOUT_MEMORY = (
-    *("MemoryError", "Insufficient memory", "bad_alloc", "memory allocation of"),
-    *("out of memory", "cannot allocate memory", "Cannot allocate memory"),
+    "MemoryError",
+    "Insufficient memory",
+    "bad_alloc",
+    "memory allocation of",
+    "out of memory",
+    "cannot allocate memory",
+    "Cannot allocate memory",
 )
 
 

@@ -31,7 +31,7 @@ from lce_rig.calibrate.plane_and_ends import (
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, chance_of
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.judge.findings import LASER_ANGLES
 from lce_rig.rig import LidarSettings
@@ -210,8 +210,6 @@ def estimate_angles(
         Rms over rings of the errors about their mean in deg, by "azimuth" and "elevation": the noise is
         subtracted, rings count by their information; 0 where noise alone explains them.
     """
-    from scipy.special import chdtrc
-
     features = [extract_features(seen, board) for seen in observations]
     sigmas = feature_sigmas(features, board, T_cam_lidar)
     rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
@@ -258,7 +256,7 @@ def estimate_angles(
         about_mean = np.eye(L) - weights / weights.sum()
         errors, variances = about_mean @ x[own], np.diag(about_mean @ cov[own, own] @ about_mean.T)
         excess = np.sum((errors**2 - variances) / variances**2) / np.sum(1 / variances**2)
-        is_sure = chdtrc(L, x[own] @ np.linalg.solve(cov[own, own], x[own])) < _CHANCE
+        is_sure = chance_of(float(x[own] @ np.linalg.solve(cov[own, own], x[own])), L) < _CHANCE
         sizes[name] = float(np.degrees(np.sqrt(max(excess, 0.0)))) if is_sure else 0.0
     return sizes
 

@@ -286,29 +286,25 @@ class _Turns(NamedTuple):
 
     def groups(self, groups: Array) -> Contrast:
         """Compare the smaller of the two groups (n, F) that differ most with the rest."""
-        from scipy.special import chdtrc
-
         order, n = np.argsort(self.angles), len(self.angles)
         cut, fall = self._divide(order, max(_MIN_SHARE, int(np.ceil(_MIN_GROUP * n))))
         smaller, rest = sorted((order[:cut], order[cut:]), key=len)
         # A gamma distribution of that mean and variance.
-        chance = float(chdtrc(2 * _MEAN_GAIN**2 * n, 2 * _MEAN_GAIN * fall))
+        chance = chance_of(2 * _MEAN_GAIN * fall, 2 * _MEAN_GAIN**2 * n)
         members = tuple(np.flatnonzero(groups[smaller].any(axis=0)).tolist())
         apart, _ = self._compare(smaller, rest)
         return Contrast("group", "rest", apart, chance, len(members), members, is_noise_known=True)
 
     def change(self) -> Contrast:
         """Compare captures before and after the largest change."""
-        from scipy.special import chdtrc
-
         order = np.arange(len(self.angles))
         cut, fall = self._divide(order, _MIN_END)
         smaller, rest = sorted((order[:cut], order[cut:]), key=len)
         # Beside an outlier, the others of its side agree with the rest.
         others = (np.delete(smaller, k) for k in range(len(smaller)))
-        is_change = chdtrc(1, min(self._compare(each, rest)[1] for each in others)) < _DIFFERS
+        is_change = chance_of(min(self._compare(each, rest)[1] for each in others), 1) < _DIFFERS
         n_tried = len(order) + 1 - 2 * _MIN_END
-        chance = min(n_tried * float(chdtrc(1, fall)), 1.0) if is_change else 1.0
+        chance = min(n_tried * chance_of(fall, 1), 1.0) if is_change else 1.0
         apart, _ = self._compare(order[:cut], order[cut:])
         return Contrast("before", "after", apart, chance, cut, is_noise_known=True)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, perturb, skew
+from lce_rig.core.geometry import Array, chance_of, perturb, skew
 from lce_rig.core.planar_pose import linearise_poses, mirror_tilt, refine_poses
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.lens.models import LensModel, LensPrior
@@ -126,8 +126,6 @@ class Setup:
             The parts of the lens's parameters that contradict, each with the ratio of variances that explains
             the distance.
         """
-        from scipy.special import chdtrc
-
         P = len(lens)
         of_prior, found = np.linalg.inv(self.information[:P, :P]), []
         for part in (slice(0, 2), slice(2, 4), slice(4, P)):
@@ -137,7 +135,7 @@ class Setup:
             along, share = axes.T @ units @ (lens - self.mean[:P])[part], 1 - left
             told = share > _TOLD
             w, squares = share[told], along[told] ** 2
-            if told.any() and float(chdtrc(len(w), np.sum(squares / w))) < chance:
+            if told.any() and chance_of(float(np.sum(squares / w)), len(w)) < chance:
                 found.append((part, max(float(np.mean(squares / w**2 - (1 - w) / w)), 1.0)))
         return found
 

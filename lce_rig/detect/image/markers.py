@@ -10,7 +10,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -272,6 +271,8 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
 
     A wrong gap shrinks or stretches single rows and columns: neither a pose nor a lens does.
     """
+    from scipy.optimize import minimize_scalar
+
     is_seen = np.isfinite(crossings.grid_px).all(axis=-1).ravel()
     flat = _flatten(crossings.grid_px.reshape(-1, 2)[is_seen], intrinsics)
     if not np.isfinite(flat).all():

@@ -102,7 +102,6 @@ def fit_outline(
     x = expected + [start.u_m, start.v_m, start.angle_rad, 0.0, 0.0]
     half = np.array(start.half_m)
     prior = np.diag([0.0, 0.0, 0.0, 1.0, 1.0]) / growth_m[1] ** 2
-    information, cost = prior, np.inf
     for k in range(_ROUNDS):
         least = annealed_m[k] if k < len(annealed_m) else 0.0
         placement = Placement(x[0], x[1], x[2], (half[0] + x[3], half[1] + x[4]))
@@ -125,9 +124,9 @@ def fit_outline(
         step = np.linalg.solve(information + 1e-3 * np.eye(5), score)
         step *= min(1.0, 0.05 / max(float(np.abs(step[:2]).max()), 1e-9))
         x = x + [cosine * step[0] - sine * step[1], sine * step[0] + cosine * step[1], *step[2:]]
-        cost = float(np.mean(-np.log(np.where(is_on, p, 1 - p))))
         if k > len(annealed_m) and np.abs(step).max() < 1e-4:
             break
+    cost = float(np.mean(-np.log(np.where(is_on, p, 1 - p))))
     placement = Placement(float(x[0]), float(x[1]), float(x[2]), start.half_m, cost)
     return Outline(placement, x[3:], np.asarray(np.linalg.inv(information), dtype=np.float64))
 
