@@ -52,10 +52,6 @@ PARTS: dict[str, tuple[str, Part]] = {
         "the same for KITTI's clouds and a simulated Mid-360",
         lambda bench, a: bench(a.seeds or 20, a.only),
     ),
-    "scene_sharpen": (
-        "boards and scene in one estimate: simulated rooms, recordings",
-        lambda bench, a: bench(a.seeds or 100, min(a.splits, 10), a.only),
-    ),
     "lidars": (
         "other LiDARs, simulated: boards found, errors, time of a search",
         lambda bench, a: bench(a.captures or 20, a.output, a.only),

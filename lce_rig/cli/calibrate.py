@@ -64,8 +64,6 @@ def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
                 off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
                 yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
         return
-    if c.scene_share is not None and c.scene_share.state == "used":
-        yield f"               of the boards alone {sizes(*sigma_sizes(c.scene_share.cov_boards))}"
     rows = {
         "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
         "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
@@ -147,9 +145,6 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     "(paper).",
 )
 @click.option(
-    "--use-scene", is_flag=True, help="Estimate from the edges of the scene too, not from the board alone."
-)
-@click.option(
     "--name",
     metavar="NAME",
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
@@ -177,7 +172,6 @@ def calibrate(
     reference: Path | None,
     cameras: tuple[str, ...],
     channels: list[str] | None,
-    use_scene: bool,
     name: str | None,
     robot: str | None,
     without: list[str] | None,
@@ -228,7 +222,6 @@ def calibrate(
                 cameras=cameras or None,
                 channels=channels,
                 reference=truth,
-                use_scene=use_scene,
                 progress=progress,
             )
         except NotEnoughDataError as error:

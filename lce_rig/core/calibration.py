@@ -277,35 +277,6 @@ MOTIONS: tuple[Motion, ...] = get_args(Motion)
 """Motions along and about the camera's axes, in the order of a tangent (6,)."""
 
 
-@dataclass(frozen=True, eq=False)
-class SceneShare:
-    """The change of the boards' extrinsics by the edges of the scene.
-
-    Attributes:
-        state: "used"; else the extrinsics are those of the boards alone, because the scene "contradicts" them
-            beyond both covariances, or is "unknown": it determines no direction better than the boards.
-        n_captures, n_edges: of the scene.
-        T_cam_lidar, cov: (4, 4), (6, 6) by boards and scene, used or not.
-        T_cam_lidar_boards, cov_boards: by the boards alone.
-        change: (6,) tangent from the boards' extrinsics to those of both, m and rad, axes of the camera.
-        change_sigma: (6,) standard deviation that it should have.
-        surprise: its square in units of that, over `n_directions`: chi-squared if both are right.
-        n_directions: determined by the scene, of six.
-    """
-
-    state: Literal["used", "contradicts", "unknown"]
-    n_captures: Count
-    n_edges: Count
-    T_cam_lidar: Pose
-    cov: Covariance
-    T_cam_lidar_boards: Pose
-    cov_boards: Covariance
-    change: Values
-    change_sigma: Values
-    surprise: Size
-    n_directions: Count
-
-
 State = Literal["unchanged", "changed", "unknown"]
 # In files of earlier versions.
 _STATES = {"agrees": "unchanged", "contradicts": "changed"}
@@ -415,7 +386,6 @@ class Calibration:
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
         square_m: the side of a square by the profile and the LiDAR.
         board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
-        scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
         held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
@@ -461,7 +431,6 @@ class Calibration:
     intrinsics_cross_cov: Values | None = None
     square_m: Size | None = None
     board_shape: Values | None = None
-    scene_share: SceneShare | None = None
     scene: (
         Annotated[
             SceneOpinion, WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
@@ -589,8 +558,8 @@ class ResultFile:
             ResultRefusedError: a pose or covariance is not finite.
         """
         for pair in self.pairs:
-            evidence = (pair, *pair.other_cameras, pair.scene_share)
-            values = [value for record in evidence if record for value in vars(record).values()]
+            evidence = (pair, *pair.other_cameras)
+            values = [value for record in evidence for value in vars(record).values()]
             if not all(np.isfinite(value).all() for value in values if isinstance(value, np.ndarray)):
                 raise ResultRefusedError(
                     f"a pose or covariance of {pair.camera} and {pair.lidar} is not finite",

@@ -271,11 +271,6 @@ def _agree(finding: Finding) -> str:
     return f"{apart}, {how} their standard deviations predict"
 
 
-_SCENE_CHANGE = (
-    "{rotation_deg:deg}, {translation_m:mm} "
-    "(expected {rotation_sigma_deg:deg}, {translation_sigma_m:mm}; {n_captures} captures, {n_edges} edges)"
-)
-
 NOT_CERTIFIED = Kind(
     "verdict.not_certified", "not certified as the global minimum (gap {gap:.1e})", "collect more captures"
 )
@@ -465,20 +460,6 @@ SCENE = Kind(
         "distances": f"check the squares {_LOOK}",
         "times": f"hold boards still {_LOOK}",
     },
-)
-SCENE_USED = Kind(
-    "verdict.scene_used", "the scene moved the boards' extrinsics by " + _SCENE_CHANGE, severity="note"
-)
-SCENE_UNKNOWN = Kind(
-    "verdict.scene_unknown",
-    "the scene shows nothing that the boards do not show better; {n_edges} edges, {n_captures} captures",
-    severity="note",
-)
-SCENE_NOT_USED = Kind(
-    "verdict.scene_not_used",
-    "the scene contradicts the boards and is not used: it would move them by " + _SCENE_CHANGE,
-    f"check intrinsics and board {_LOOK}",
-    severity="warning",
 )
 ELSEWHERE = Kind(
     "verify.elsewhere",

@@ -8,9 +8,9 @@ import numpy as np
 
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare
+from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding, Refusal, Severity
-from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
@@ -34,9 +34,6 @@ from lce_rig.judge.findings import (
     ROTATION_UNCERTAIN,
     SCALE_OFF,
     SCENE,
-    SCENE_NOT_USED,
-    SCENE_UNKNOWN,
-    SCENE_USED,
     SENSORS_DISAGREE,
     SHARES_DIFFER,
     TRANSLATION_UNCERTAIN,
@@ -208,23 +205,6 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
     sigmas = abs(worst.change) / worst.sigma
     sizes: dict[str, Any] = {f"change_{worst.unit}": worst.change, f"sigma_{worst.unit}": worst.sigma}
     return [SCENE(severity=failing(sigmas > SCENE_FAILS), action=action, axis=worst.axis, **sizes)]
-
-
-def share_findings(share: SceneShare) -> list[Finding]:
-    """State what the scene did to the extrinsics of the boards."""
-    rotation_deg, translation_m = tangent_sizes(share.change)
-    rotation_sigma_deg, translation_sigma_m = tangent_sizes(share.change_sigma)
-    kind = {"contradicts": SCENE_NOT_USED, "used": SCENE_USED, "unknown": SCENE_UNKNOWN}[share.state]
-    return [
-        kind(
-            rotation_deg=rotation_deg,
-            translation_m=translation_m,
-            rotation_sigma_deg=rotation_sigma_deg,
-            translation_sigma_m=translation_sigma_m,
-            n_captures=share.n_captures,
-            n_edges=share.n_edges,
-        )
-    ]
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:

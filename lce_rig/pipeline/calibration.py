@@ -4,9 +4,8 @@ detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, t
 two LiDARs (`lidar_pairs`) -> the scene's opinion
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -22,10 +21,10 @@ from lce_rig.calibrate import (
 )
 from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.options import Tolerances
-from lce_rig.calibrate.result import capture_residual, error_to_reference, squares_scale
+from lce_rig.calibrate.result import error_to_reference, squares_scale
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.collect.guidance.planner import plan_captures
-from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
+from lce_rig.core.calibration import Calibration, OtherCamera
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, relative_pose, sigma_sizes, tangent_sizes
@@ -46,13 +45,13 @@ from lce_rig.judge.sensor_pairs import (
 )
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
-from lce_rig.judge.verdict import judge, share_findings, with_opinion
+from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
 from lce_rig.pipeline.lidar_pairs import calibrate_lidar_pairs, close
 from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
+from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 
@@ -68,7 +67,6 @@ class _Solved:
         estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
         together: the estimate of several cameras that it is part of; None where it stands alone.
-        share: what the scene did to the extrinsics; None where it was not asked.
     """
 
     pairs: tuple[Pair, ...]
@@ -77,7 +75,6 @@ class _Solved:
     estimate: CalibrationEstimate
     validation: Validation
     together: TogetherEstimate | None = None
-    share: SceneShare | None = None
 
     @property
     def camera(self) -> str:
@@ -134,7 +131,6 @@ def calibrate(
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
-    use_scene: bool = False,
     progress: Progress = silent,
 ) -> Result:
     """Estimate and judge the extrinsics of every camera with every LiDAR, and of every two LiDARs.
@@ -148,7 +144,6 @@ def calibrate(
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
-        use_scene: estimate each frame camera from the edges of the scene, too.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
@@ -165,7 +160,6 @@ def calibrate(
         options,
         cameras=cameras,
         channels=channels,
-        scene=partial(sharpen, session, detections) if use_scene else None,
         progress=progress,
     )
     begin(progress, "comparing with the scene")
@@ -178,7 +172,7 @@ def calibrate(
         if c.is_of_lidars:
             judged.append(c)
             continue
-        c = with_opinion(c, hear_scene(session, detections, by_boards(c)))
+        c = with_opinion(c, hear_scene(session, detections, c))
         if lacks_captures(c.findings):
             held = boards_in(detections, c.camera, c.lidar, c.captures_used)
             c = replace(c, findings=(*c.findings, *plan_captures(session.rig, c.camera, c.lidar, held, c)))
@@ -193,7 +187,6 @@ def calibrate_detections(
     *,
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
-    scene: Callable[[Calibration], SceneShare] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
@@ -205,7 +198,6 @@ def calibrate_detections(
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
         options, cameras, channels, progress: as of `calibrate`.
-        scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.
@@ -245,13 +237,6 @@ def calibrate_detections(
     links = _compare(rig, detections, alone)
     solved = _solve_together(rig, detections, alone, links)
     calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
-    if scene is not None:
-        begin(progress, "estimating from the scene")
-        for k, c in enumerate(calibrations):
-            # Boards and scene share the session's lens, too.
-            share = scene(replace(c, cov_shared=c.cov_shared + solved[k].cov_lens))
-            solved[k] = _with_scene(rig, solved[k], share)
-        calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     return close([*calibrations, *between], rig), shortages
 
 
@@ -385,31 +370,6 @@ def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone
     return replace(alone, estimate=estimate, validation=validation, together=together)
 
 
-def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
-    """Take the extrinsics of boards and scene; the checks on the boards' own result stay as they are."""
-    if share.state != "used":
-        return replace(solved, share=share)
-    estimate, board = solved.estimate, rig.board.to_board()
-    # Residuals of the boards under the extrinsics of both.
-    residuals = tuple(
-        capture_residual(
-            share.T_cam_lidar,
-            estimate.observations[each.capture],
-            board,
-            each.held_out_m,
-            squares_scale(estimate.diagnostics),
-        )
-        for each in estimate.residuals
-    )
-    return replace(
-        solved,
-        estimate=replace(estimate, T_cam_lidar=share.T_cam_lidar, cov=share.cov, residuals=residuals),
-        validation=replace(solved.validation, cov=share.cov, cov_agreed=share.cov),
-        together=None,
-        share=share,
-    )
-
-
 def _judged(
     rig: Rig,
     detections: Detections,
@@ -422,8 +382,6 @@ def _judged(
     mine = [link for link in links if k in link.members]
     others = [finding for link in mine for finding in link.exchanged]
     others += [finding for link in mine for finding in link.contradictions]
-    if own.share is not None:
-        others += share_findings(own.share)
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())
     verdict, findings = judge(
@@ -435,10 +393,8 @@ def _judged(
         refused |= dict.fromkeys(estimate.captures_of([name]), why)
     lens = None if estimate.lens is None else estimate.lens.intrinsics
     square_m = rig.board.square_m * squares_scale(estimate.diagnostics)
-    # The scene moves extrinsics, not the lens.
-    is_of_scene = own.share is not None and own.share.state == "used"
     cov_lens = np.zeros((0, 0)) if estimate.lens is None else estimate.lens.estimate.cov
-    cross = (0.0 if is_of_scene else 1.0) * estimate.cov_with_lens
+    cross = estimate.cov_with_lens
     distances_m = [np.linalg.norm(o.image.T_cam_board[:3, 3]) for o in estimate.observations.values()]
     return Calibration(
         camera=own.camera,
@@ -476,7 +432,6 @@ def _judged(
             for link in mine
             if link.pair is not None
         ),
-        scene_share=own.share,
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,

@@ -1,13 +1,12 @@
 """How well extrinsics bring a scene's depth edges onto its image edges, by part of the scene."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, perturb, skew, transform
+from lce_rig.core.geometry import Array, perturb, transform
 from lce_rig.scene.depth_edges import CHANNELS, DepthEdges
 from lce_rig.scene.edge_field import EdgeField
 
@@ -16,7 +15,6 @@ IS_ROTATION = np.array([False, False, False, True, True, True])
 _COLUMNS, _ROWS = 8, 3  # parts of the image
 _BESIDE_RAD = 0.05
 """Edges so far outside the image count: other extrinsics bring them in."""
-_SCALE_RAD = 0.003  # of derivatives: about the field's blur
 _REACH = np.where(IS_ROTATION, np.radians(3.0), 0.3)
 _STEPS = np.linspace(-1.0, 1.0, 61)
 
@@ -59,16 +57,11 @@ class Alignment:
         row = np.clip(pixels[near, 1] / intrinsics.height_px * _ROWS, 0, _ROWS - 1).astype(np.intp)
         # Each channel has its own parts: it is a witness of its own.
         channel = np.concatenate([view.edges.channel for view in views])[near].astype(np.intp)
-        self._part, self._level = (channel * _COLUMNS + column) * _ROWS + row, 0
+        self._part = (channel * _COLUMNS + column) * _ROWS + row
 
     def __len__(self) -> int:
         """Count the depth edges in or near the images."""
         return len(self._points)
-
-    @property
-    def points(self) -> Array:
-        """The depth edges in or near the images, (N, 3) m, frame lidar."""
-        return self._points
 
     @property
     def weight_of_parts(self) -> Array:
@@ -89,38 +82,6 @@ class Alignment:
         """Score extrinsics (..., 4, 4): each edge's share (..., N), divided by the number of captures."""
         pixels, _ = self._intrinsics.project(transform(T_cam_lidar, self._points))
         return self._weight / self.n_captures * self._sample(pixels)
-
-    def expand(self, T_cam_lidar: Array) -> tuple[Array, Array]:
-        """Differentiate each depth edge's share of the score, at the scale of the field's blur.
-
-        Args:
-            T_cam_lidar: (4, 4).
-
-        Returns:
-            Gradients (N, 6) and second derivatives (N, 6, 6) by the tangent, curvature of the field only.
-        """
-        points = transform(T_cam_lidar, self._points)
-        pixels, is_valid = self._intrinsics.project(points)
-        h = _SCALE_RAD * self._intrinsics.fx_px * 2**self._level
-        shifts = h * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
-        at, right, left, down, up, rd, ru, ld, lu = self._sample(pixels + shifts[:, None])
-        slope = np.stack([right - left, down - up], axis=-1) / (2 * h)
-        mixed = (rd - ru - ld + lu) / 4
-        bend = np.stack([right - 2 * at + left, mixed, mixed, down - 2 * at + up], axis=-1) / h**2
-        scale = np.where(is_valid, self._weight / self.n_captures, 0.0)
-        by_tangent = np.concatenate(
-            [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points - T_cam_lidar[:3, 3])], axis=2
-        )
-        jacobian = np.where(is_valid[:, None, None], self._intrinsics.differentiate(points) @ by_tangent, 0.0)
-        gradients = (scale[:, None] * slope)[:, None] @ jacobian
-        bends = (scale[:, None] * bend).reshape(-1, 2, 2)
-        return gradients[:, 0], np.swapaxes(jacobian, 1, 2) @ bends @ jacobian
-
-    def coarser(self) -> "Alignment":
-        """Halve the resolution of the fields: a wider basin about a blunter maximum."""
-        coarse = copy(self)
-        coarse._fields, coarse._level = [field.coarser() for field in self._fields], self._level + 1
-        return coarse
 
     def curve(self, axis: int, start: Array) -> "Curve":
         """Score extrinsics along one axis of the tangent, the others as in `start` (6,)."""

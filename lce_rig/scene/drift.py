@@ -10,7 +10,6 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import KINDS, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.scene.alignment import IS_ROTATION, Alignment, Curve, SceneView
-from lce_rig.scene.estimate import BIAS
 from lce_rig.scene.findings import (
     AXIS_CHANGED,
     AXIS_UNCHANGED,
@@ -30,6 +29,8 @@ POWER_SIGMAS = 1.645
 """At the smallest change, 95 % of the trials exceed the threshold."""
 LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
 """A witness that sees only larger changes cannot tell, rad and m, order of MOTIONS."""
+_BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.10, 0.05, 0.15])])
+"""What one scene's maximum is off by beyond the scatter of its parts: sigmas in the order of MOTIONS."""
 NEARLY = 0.1
 """What scores so much less alone, as a share, may be what changed."""
 _MIN_EDGES = 60
@@ -153,7 +154,7 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     """Decide one axis from the score along it."""
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
     peak, scatter = curve.peak, curve.sigma()
-    sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + BIAS[axis] ** 2))
+    sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + _BIAS[axis] ** 2))
     smallest = max(
         (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
     )

@@ -49,10 +49,6 @@ class EdgeField:
         is_near = EdgeField(np.asarray(near, dtype=np.float32), self.reduction).sample(pixels) > 0
         return np.asarray(is_near, dtype=np.bool_)
 
-    def coarser(self) -> "EdgeField":
-        """Blur and halve the field."""
-        return EdgeField(np.asarray(cv2.pyrDown(self.values), dtype=np.float32), 2 * self.reduction)
-
 
 def build_edge_field(grey: NDArray[np.uint8], focal_px: float) -> EdgeField:
     """Turn an image into a field of its upright edges.

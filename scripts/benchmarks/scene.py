@@ -69,8 +69,8 @@ class _Watched:
     def room(cls, seed: int, *, ignore_board: bool) -> "_Watched":
         """Calibrate a simulated room and find its edges."""
         room = furnished_room("rlfs", seed)
-        c = room.calibrate(room.names)
-        views = room.views(room.names, c, ignore_board=ignore_board)
+        c = room.calibrate()
+        views = room.views(c, ignore_board=ignore_board)
         return cls(room.rig, c, _samples(room.session, c), views, ignore_board)
 
     @property

@@ -3,7 +3,6 @@
 Pictures have half the resolution, which renders in a quarter of the time.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -56,53 +55,27 @@ class FurnishedRoom:
         """The camera's intrinsics."""
         return self.rig.cameras[self.camera].to_intrinsics()
 
-    @property
-    def names(self) -> list[str]:
-        """The captures."""
-        return [capture.name for capture in self.session.captures]
-
     @cached_property
     def detections(self) -> Detections:
         """The boards of all captures."""
         return lce.detect(self.session, n_threads=1)
 
-    def calibrate(self, names: Sequence[str]) -> Calibration:
-        """Calibrate on the boards of some captures alone, three at least.
-
-        Raises:
-            NotEnoughDataError: they are too few.
-        """
-        (calibration,), _ = calibrate_detections(with_few(self.rig), only(self.detections, names))
+    def calibrate(self) -> Calibration:
+        """Calibrate on the boards of all captures alone."""
+        (calibration,), _ = calibrate_detections(self.rig, self.detections)
         return calibration
 
-    def views(
-        self, names: Sequence[str], calibration: Calibration, *, ignore_board: bool = False
-    ) -> list[SceneView]:
-        """Find the edges of some captures, without those at the board if it is to be ignored."""
+    def views(self, calibration: Calibration, *, ignore_board: bool = False) -> list[SceneView]:
+        """Find the edges of all captures, without those at the board if it is to be ignored."""
         views = []
         for capture in self.session.captures:
-            if capture.name in names:
-                image, scan = capture.image(self.camera, "frames"), capture.scan(calibration.lidar)
-                view = build_view(self.rig, calibration, capture.name, image, scan)
-                if ignore_board:
-                    found = self.detections.images[self.camera, "frames"][capture.name]
-                    view = without_board(view, found, self.rig, calibration)
-                views.append(view)
+            image, scan = capture.image(self.camera, "frames"), capture.scan(calibration.lidar)
+            view = build_view(self.rig, calibration, capture.name, image, scan)
+            if ignore_board:
+                found = self.detections.images[self.camera, "frames"][capture.name]
+                view = without_board(view, found, self.rig, calibration)
+            views.append(view)
         return views
-
-
-def with_few(rig: Rig) -> Rig:
-    """Accept three captures."""
-    return rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": 3})})
-
-
-def only(every: Detections, names: Sequence[str]) -> Detections:
-    """Keep the detections of some captures."""
-    return replace(
-        every,
-        images={key: {k: v for k, v in of.items() if k in names} for key, of in every.images.items()},
-        lidars={key: {k: v for k, v in of.items() if k in names} for key, of in every.lidars.items()},
-    )
 
 
 def furnished_room(

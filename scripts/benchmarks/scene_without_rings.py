@@ -67,7 +67,7 @@ def _room(seed: int) -> _Group:
     """Simulate five captures of a Mid-360 in a furnished room, without what moves in it."""
     room = furnished_room("mid360", seed, 5)
     c = made_calibration(room.T_cam_lidar, _COV)
-    views = room.views(room.names, c)
+    views = room.views(c)
     standing = leave_standing([view.edges for view in views])
     views = [SceneView(view.capture, edges, view.field) for view, edges in zip(views, standing, strict=True)]
     return views, room.lens, room.T_cam_lidar

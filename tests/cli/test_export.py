@@ -95,5 +95,5 @@ def test_calibrate_writes_the_formats_of_the_profile(lce_rig, simulated, tmp_pat
     assert lce_rig("calibrate", session).code == 0
     names = {path.name for path in (session / "calibration").iterdir()} - {"report.html"}
     assert names == {"result.json", "opencv_davis.yaml", "tf_static"}
-    assert lce_rig("calibrate", session, "--use-scene").code == 0
+    assert lce_rig("calibrate", session, "--method", "paper").code == 0
     assert names <= {path.name for path in (session / "calibration/previous").iterdir()}

@@ -38,21 +38,6 @@ def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session)
     assert {"result.json", "report.html", "extrinsics.yaml", "rles.urdf", "static_transforms.txt"} <= names
 
 
-@pytest.mark.long
-def test_calibrate_uses_the_scene_if_asked_and_keeps_the_result_of_the_boards_beside_it(lce_rig, calibrated):
-    alone = read(calibrated / "calibration" / "result.json")["pairs"][0]
-    assert alone["scene_share"] is None
-    outcome = lce_rig("calibrate", calibrated, "--use-scene", "--name", "scene", "--json")
-    pair = json.loads(outcome.out)["pairs"][0]
-    share = pair["scene_share"]
-    assert share["T_cam_lidar_boards"] == alone["T_cam_lidar"] and share["cov_boards"] == alone["cov"]
-    told = {"used": "scene_used", "unknown": "scene_unknown", "contradicts": "scene_not_used"}[share["state"]]
-    assert f"verdict.{told}" in {finding["code"] for finding in pair["findings"]}
-    final = share if share["state"] == "used" else alone
-    assert pair["T_cam_lidar"] == final["T_cam_lidar"] and pair["cov"] == final["cov"]
-    assert share["n_captures"] == 16 and share["n_edges"] > 0
-
-
 def test_a_result_fits_twelve_lines_of_a_terminal_and_explains_itself_if_asked(lce_rig, calibrated):
     first = (calibrated / "calibration" / "result.json").read_bytes()
     brief = lce_rig("calibrate", calibrated)

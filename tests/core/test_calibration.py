@@ -20,7 +20,6 @@ from lce_rig.core.calibration import (
     PointUncertainty,
     Provenance,
     SceneOpinion,
-    SceneShare,
     read_result,
 )
 from lce_rig.core.errors import ResultRefusedError, SessionError
@@ -38,7 +37,7 @@ FIELDS = [
     *("findings", "diagnostics", "channels", "method", "uncertainty", "estimated_with", "other_cameras"),
     *("cov_shared", "contributions", "intrinsics", "intrinsics_cov", "intrinsics_cross_cov", "square_m"),
     "board_shape",
-    *("scene_share", "scene", "board_distances_m"),
+    *("scene", "board_distances_m"),
 ]
 REQUIRED = [
     *("camera", "channel", "lidar", "T_cam_lidar", "cov", "n_captures", "n_detected", "captures_used"),
@@ -67,7 +66,6 @@ def full():
         ),
         cov_shared=0.1 * cov,
         contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),
-        scene_share=SceneShare("used", 2, 50, T, cov, T, 2 * cov, np.arange(6.0), np.ones(6), 3.0, 4),
         scene=SceneOpinion(2, 70, (AxisDrift("rotation_x", "unchanged", -0.1, 0.2, np.inf),)),
         board_distances_m=(1.5, 3.25),
     )

@@ -9,11 +9,11 @@ import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import AxisDrift, ChannelResult, SceneOpinion, read_result
-from lce_rig.core.geometry import perturb
+from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.judge.verdict import with_opinion
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.verification import verify
-from lce_rig.pipeline.witness import hear_scene
+from lce_rig.pipeline.witness import hear_scene, scene_views
 from lce_rig.session import Session
 from tests.saved_results import write_result
 
@@ -71,6 +71,17 @@ def test_of_moving_boards_the_times_may_be_wrong(seen):
     slight = AxisDrift("rotation_y", "changed", 0.31, 0.1, 0.5)
     judged = with_opinion(moving, SceneOpinion(6, 500, (slight,)))
     assert judged.findings[0].action == "times"
+
+
+def test_the_board_is_left_out(heard, seen):
+    session, detections = heard
+    views = scene_views(session, detections, seen.truth)
+    assert [view.capture for view in views] == [capture.name for capture in session.captures]
+    size_m = np.array([seen.rig.board.width_m, seen.rig.board.height_m])
+    for view, capture in zip(views, seen.captures, strict=True):
+        on_board = transform(invert(capture.T_lidar_board["lidar"]), view.edges.points)
+        is_near = np.all(np.abs(on_board) < [*(0.5 * size_m + 0.03), 0.1], axis=1)
+        assert len(view.edges) > 20 and not is_near.any()
 
 
 def session_of(seen, path, images_of):
