@@ -7,9 +7,9 @@ missed, or a frame that its driver did not number, shifts every later image by w
 is sought again.
 """
 
-from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterator
+from itertools import islice, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -27,7 +27,8 @@ _N_DELAYS = 31
 _NEAR = 0.3
 _N_PULSES = 1024
 _N_RECENT = 8
-_MAX_INTERPOLATED = 8
+# From a pulse to the next whose line came, at most, for those between to be placed between the two.
+_MAX_STEPS = 8
 
 
 class TriggeredImage(NamedTuple):
@@ -73,7 +74,8 @@ class TriggerMatcher:
         self._camera = camera
         self._max_delay_ns = max_delay_ns
         self._clock: ClockModel | None = None
-        self._pulses = PulseLog()
+        # Board times of the last pulses by their numbers, both rising.
+        self._pulses: dict[int, int] = {}
         self._waiting: deque[_Waiting] = deque()
         self._agreeing: list[_Waiting] = []
         self._constant: int | None = None
@@ -88,13 +90,20 @@ class TriggerMatcher:
 
     def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
         """Take a pulse, and give the images that waited for it."""
-        if len(self._pulses) and pulse.count <= self._pulses.last_count:
-            if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
+        last_count, last_ns = next(reversed(self._pulses.items()), (pulse.count - 1, 0))
+        if pulse.count <= last_count:
+            if self._pulses.get(pulse.count) == pulse.stamp_ns:
                 self.counts["n_repeated"] += 1
                 return []
             self._restart(findings.BOARD_RESTARTED)
             self._pulses.clear()
-        self._pulses.add(pulse.count, pulse.stamp_ns)
+        elif (n_steps := pulse.count - last_count) <= _MAX_STEPS:
+            # Pulses whose lines were lost lie between their neighbours.
+            step_ns = (pulse.stamp_ns - last_ns) / n_steps
+            self._pulses |= {last_count + k: last_ns + round(k * step_ns) for k in range(1, n_steps)}
+        self._pulses[pulse.count] = pulse.stamp_ns
+        while len(self._pulses) > _N_PULSES:
+            del self._pulses[next(iter(self._pulses))]
         return list(self._proceed())
 
     def take_image(self, image: Image) -> list[TriggeredImage]:
@@ -121,24 +130,25 @@ class TriggerMatcher:
         return list(self._proceed())
 
     def _proceed(self) -> Iterator[TriggeredImage]:
-        while self._waiting and len(self._pulses):
+        while self._waiting and self._pulses:
             frame = self._waiting[0]
+            last_count, last_ns = next(reversed(self._pulses.items()))
             if self._constant is None:
                 # Only when the pulses have come past an image's time are all that could be its own known.
-                if self._pulses.last_ns <= frame.board_ns:
+                if last_ns <= frame.board_ns:
                     return
                 yield from self._seek(self._waiting.popleft())
-            elif frame.number - self._constant > self._pulses.last_count:
+            elif frame.number - self._constant > last_count:
                 return
             else:
-                yield from self._follow(self._waiting.popleft())
+                yield from self._follow(self._waiting.popleft(), self._constant)
 
     def _seek(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         """Look for the constant: the same for several images in a row, each with one possible pulse."""
         window_ns = self._max_delay_ns
-        possible = self._pulses.within(frame.board_ns - window_ns, frame.board_ns)
+        possible = [n for n, ns in self._pulses.items() if 0 <= frame.board_ns - ns <= window_ns]
         # A pulse lost on the way is missing among the possible, and makes another look like the only one.
-        is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < window_ns
+        is_ambiguous = len(possible) > 1 or self._period_ns() < window_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:
             self.problem = findings.AMBIGUOUS_PULSES(self._camera, window_ms=window_ns / 1e6)
@@ -154,26 +164,21 @@ class TriggerMatcher:
         if len(self._agreeing) == N_AGREE:
             self._constant, self.problem = constant, None
             agreeing, self._agreeing = self._agreeing, []
-            for image in agreeing:
-                pulse = self._pulses.time_of(image.number - constant)
-                assert pulse is not None
-                self._delays_ns.append(image.board_ns - pulse)
-            for image in agreeing:
-                yield from self._emit(image)
+            self._delays_ns.extend(each.board_ns - self._pulses[each.number - constant] for each in agreeing)
+            for each in agreeing:
+                yield self._matched(each, each.number - constant)
 
-    def _follow(self, frame: _Waiting) -> Iterator[TriggeredImage]:
+    def _follow(self, frame: _Waiting, constant: int) -> Iterator[TriggeredImage]:
         """Match by number, and keep an eye on the time."""
-        assert self._constant is not None
-        number = frame.number - self._constant
-        pulse = self._pulses.time_of(number)
-        if pulse is None:
+        number = frame.number - constant
+        if number not in self._pulses:
             self.counts["n_unmatched"] += 1
             return
-        late_ns = frame.board_ns - pulse - round(median(self._delays_ns))
-        if abs(late_ns) < _NEAR * self._pulses.period_ns(number):
+        delay_ns = frame.board_ns - self._pulses[number]
+        if abs(delay_ns - median(self._delays_ns)) < _NEAR * self._period_ns():
             self._n_odd = 0
-            yield from self._emit(frame)
-            self._delays_ns.append(frame.board_ns - pulse)
+            yield self._matched(frame, number)
+            self._delays_ns.append(delay_ns)
             return
         # One timestamp may be late; several in a row tell that the counts have slipped.
         self.counts["n_unmatched"] += 1
@@ -181,15 +186,15 @@ class TriggerMatcher:
         if self._n_odd == N_AGREE:
             self._restart(findings.PULSES_NOT_FOLLOWED)
 
-    def _emit(self, frame: _Waiting) -> Iterator[TriggeredImage]:
-        assert self._constant is not None
-        number = frame.number - self._constant
-        pulse = self._pulses.time_of(number)
-        if pulse is None:
-            self.counts["n_unmatched"] += 1
-            return
+    def _matched(self, frame: _Waiting, number: int) -> TriggeredImage:
         self.counts["n_matched"] += 1
-        yield TriggeredImage(frame.image, number, pulse, pulse + round(median(self._delays_ns)))
+        pulse_ns = self._pulses[number]
+        return TriggeredImage(frame.image, number, pulse_ns, pulse_ns + round(median(self._delays_ns)))
+
+    def _period_ns(self) -> float:
+        """Return the shortest time between two of the last few pulses; infinite where there is but one."""
+        recent = islice(reversed(self._pulses.values()), _N_RECENT)
+        return min((after - before for after, before in pairwise(recent)), default=float("inf"))
 
     def _restart(self, reason: Kind) -> None:
         self.problem = reason(self._camera)
@@ -207,78 +212,3 @@ class TriggerMatcher:
     def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
         self.counts["n_unmatched"] += len(frames)
         frames.clear()
-
-
-class PulseLog:
-    """The last thousand pulses of one line, numbers and board times rising."""
-
-    def __init__(self) -> None:
-        self._counts: list[int] = []
-        self._times_ns: list[int] = []
-
-    def __len__(self) -> int:
-        return len(self._counts)
-
-    def __contains__(self, time_ns: int) -> bool:
-        at = bisect_left(self._times_ns, time_ns)
-        return at < len(self._times_ns) and self._times_ns[at] == time_ns
-
-    def add(self, count: int, time_ns: int) -> None:
-        """Append a pulse."""
-        self._counts.append(count)
-        self._times_ns.append(time_ns)
-        if len(self._counts) > 2 * _N_PULSES:
-            del self._counts[:_N_PULSES], self._times_ns[:_N_PULSES]
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._counts.clear()
-        self._times_ns.clear()
-
-    @property
-    def last_count(self) -> int:
-        """Number of the last pulse."""
-        return self._counts[-1]
-
-    @property
-    def last_ns(self) -> int:
-        """Time of the last pulse."""
-        return self._times_ns[-1]
-
-    def within(self, start_ns: float, end_ns: float) -> list[int]:
-        """List the numbers of the pulses from a time to another, both included."""
-        first = bisect_left(self._times_ns, start_ns)
-        return [
-            count
-            for count, time_ns in zip(self._counts[first:], self._times_ns[first:], strict=True)
-            if time_ns <= end_ns
-        ]
-
-    def time_of(self, count: int) -> int | None:
-        """Find the time of a pulse, between its neighbours' where it is lost; None where they are far."""
-        after = bisect_left(self._counts, count)
-        if after < len(self._counts) and self._counts[after] == count:
-            return self._times_ns[after]
-        if not 0 < after < len(self._counts):
-            return None
-        n_apart = self._counts[after] - self._counts[after - 1]
-        if n_apart > _MAX_INTERPOLATED:
-            return None
-        span_ns = self._times_ns[after] - self._times_ns[after - 1]
-        return self._times_ns[after - 1] + span_ns * (count - self._counts[after - 1]) // n_apart
-
-    def period_ns(self, count: int) -> float:
-        """Return the time between two pulses about a number; infinite where there is but one pulse."""
-        if len(self._counts) < 2:
-            return float("inf")
-        after = min(max(bisect_left(self._counts, count), 1), len(self._counts) - 1)
-        return self._period_before(after)
-
-    def least_period_ns(self) -> float:
-        """Return the shortest time between two pulses among the last few."""
-        recent = range(max(1, len(self._counts) - _N_RECENT), len(self._counts))
-        return min((self._period_before(after) for after in recent), default=float("inf"))
-
-    def _period_before(self, after: int) -> float:
-        n_apart = self._counts[after] - self._counts[after - 1]
-        return (self._times_ns[after] - self._times_ns[after - 1]) / n_apart
