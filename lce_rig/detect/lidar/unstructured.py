@@ -35,7 +35,7 @@ from lce_rig.detect.lidar.outline import (
     register_rays,
     thin,
 )
-from lce_rig.detect.lidar.plates import Plates
+from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
     LOOK_TURN,
     MARGIN_M,
@@ -175,11 +175,12 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     n_cells = len(centres)
     near = coo_array((np.ones(len(pairs)), pairs.T), shape=(n_cells, n_cells)).tocsr()
     around = np.asarray(near @ sums + near.T @ sums + sums, dtype=np.float64)
-    normal, thinnest, middle = _principal(around)
-    flat = (around[:, 0] >= _MIN_CELL_POINTS) & (middle > (0.35 * cell_m) ** 2)
+    plane, _, eigenvalues = fit_planes(around)
+    normal = plane[:, :3]
+    flat = (around[:, 0] >= _MIN_CELL_POINTS) & (eigenvalues[:, 1] > (0.35 * cell_m) ** 2)
+    flat &= eigenvalues[:, 0] < (2.0 * _NOISE_M) ** 2
     if not flat.any():
         return Plates.none()
-    flat &= thinnest < (2.0 * _NOISE_M) ** 2
     i, j = pairs.take(np.flatnonzero(flat[pairs].all(axis=1)), axis=0).T
     of_i, of_j = normal.take(i, axis=0), normal.take(j, axis=0)
     apart = centres.take(j, axis=0) - centres.take(i, axis=0)
@@ -195,40 +196,6 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     alike = sums / sums[:, :1]
     totals = [np.bincount(label, column, n_patches)[large] for column in alike.T]
     return Plates.of(np.array(totals, dtype=np.float64).T, np.zeros(len(large), dtype=np.intp))
-
-
-def _principal(sums: Array) -> tuple[Array, Array, Array]:
-    """Compute normals (K, 3) of either sign, and the least and middle eigenvalue, of sums (K, 13) of points.
-
-    In closed form, a fifth of the time of `numpy.linalg.eigh`. With q a third of the trace of the covariance
-    C, and p^2 = |C - q I|^2 / 6, the eigenvalues are q + 2 p cos(phi + 2 pi k / 3), cos 3 phi = |C - q I| / 2
-    p^3; the normal is a column of the adjugate of C less its least eigenvalue.
-
-    References:
-        Smith, "Eigenvalues of a symmetric 3 x 3 matrix", Communications of the ACM, 1961.
-    """
-    mean = (sums[:, 1:] / sums[:, :1]).T
-    x, y, z = mean[:3]
-    xx, xy, xz = mean[3] - x * x, mean[4] - x * y, mean[5] - x * z
-    yy, yz, zz = mean[7] - y * y, mean[8] - y * z, mean[11] - z * z
-    q = (xx + yy + zz) / 3
-    xx, yy, zz = xx - q, yy - q, zz - q
-    p = np.sqrt((xx**2 + yy**2 + zz**2) / 6 + (xy**2 + xz**2 + yz**2) / 3)
-    det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    phi = np.arccos(np.clip(det / np.maximum(2 * p**3, np.finfo(float).tiny), -1, 1)) / 3
-    least, most = 2 * p * np.cos(phi + 2 * np.pi / 3), 2 * p * np.cos(phi)
-    xx, yy, zz = xx - least, yy - least, zz - least
-    of_xy, of_xz, of_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    rows = (
-        (yy * zz - yz * yz, of_xy, of_xz),
-        (of_xy, xx * zz - xz * xz, of_yz),
-        (of_xz, of_yz, xx * yy - xy * xy),
-    )
-    adjugate = np.array(rows)
-    longest = np.argmax(np.einsum("iik->ik", adjugate), axis=0)
-    normal = adjugate[longest, :, np.arange(len(q))]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    return normal, q + least, q - least - most
 
 
 def _sum_cells(points: Array, cell_m: float) -> Array:
