@@ -121,12 +121,12 @@ IMAGE_OTHER_IDS = Kind(
 IMAGE_OTHER_LAYOUT = Kind(
     "image.other_layout",
     "{n_fitting} of {n_markers} markers lie where the profile's board has them",
-    "correct board.squares, or board.tags and board.tag_spacing",
+    "correct board.squares and marker_m, or board.tags and tag_spacing",
 )
 IMAGE_OTHER_SPACING = Kind(
     "image.other_spacing",
-    "{part} measure {share:g} of the side of {unit}, {stated:g} in the profile",
-    "measure the print and correct board.{key}",
+    "gaps between tags measure {share:g} of the side of a tag, {stated:g} in the profile",
+    "measure the print and correct board.tag_spacing",
 )
 IMAGE_FEW_CORNERS = Kind(
     "image.few_corners",

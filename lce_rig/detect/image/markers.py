@@ -53,8 +53,6 @@ _DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
 # What differs by fewer deviations of the measurement is not known to differ.
 _MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
 _GAP_SHARES = (0.05, 1.2)
-# As far may they seem to differ by the corners of markers, which lie up to a pixel inside.
-_MAX_SHARE_OFF = 0.1
 
 
 def find_marked_grid(
@@ -84,14 +82,14 @@ def find_marked_grid(
         return _other_dictionary(grey, board, len(places)) if is_thorough else None
     T_cam_board, n_fitting, is_legacy = _agree(ours, board, intrinsics)
     if T_cam_board is None or n_fitting < max(_MIN_MARKERS, _MIN_FITTING * len(ours)):
-        other = _with_other_spacing(ours, board, intrinsics)
-        return other or IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
+        return IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
     crossings, n_seen = _measure(grey, board, intrinsics, T_cam_board, is_legacy)
     if crossings is None:
-        other = _with_other_spacing(ours, board, intrinsics)
-        return other or IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
+        return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
     gap_share = _measure_gap(crossings, board, intrinsics) if board.type == "aprilgrid" else None
-    return crossings if gap_share is None else _other_spacing(board, gap_share)
+    if gap_share is None:
+        return crossings
+    return IMAGE_OTHER_SPACING.refusal(share=round(gap_share, 3), stated=board.gap_share)
 
 
 def keep_marked(
@@ -238,34 +236,6 @@ def _flatten(pixels: Array, intrinsics: Intrinsics) -> Array:
     return np.asarray(flat.reshape(pixels.shape))
 
 
-def _with_other_spacing(places: Places, board: Board, intrinsics: Intrinsics) -> Refusal | None:
-    """Measure gaps or markers where the profile's do not explain the image; None if no others do.
-
-    A homography takes the lattice of their centres to the image, and their corners back to units of its side.
-    """
-    ids = sorted(places)
-    flat = _flatten(np.array([places[number] for number in ids]), intrinsics)
-    if len(ids) < 4 or not np.isfinite(flat).all():
-        return None
-    pitch_m = board.square_m * (1 + (board.gap_share if board.type == "aprilgrid" else 0.0))
-    for markers, _, _ in _readings(board):
-        centres = markers.corners[np.array(ids) - board.first_id, :, :2].mean(axis=1) / pitch_m
-        H, is_fitting = cv2.findHomography(flat.mean(axis=1), centres, cv2.RANSAC, _MAX_AWAY)
-        if H is None:
-            continue
-        lattice = cv2.perspectiveTransform(flat[is_fitting.ravel() > 0].reshape(1, -1, 2), H)
-        side = float(np.median(np.linalg.norm(np.diff(lattice.reshape(-1, 4, 2), axis=1), axis=-1)))
-        share, stated = side, board.marker_share
-        other = replace(board, marker_share=share)
-        if board.type == "aprilgrid":
-            share, stated = 1 / side - 1, board.gap_share
-            other = replace(board, gap_share=share)
-        n_fitting = _agree(places, other, intrinsics)[1]
-        if abs(share - stated) > _MAX_SHARE_OFF and n_fitting >= max(4, _MIN_FITTING * len(ids)):
-            return _other_spacing(board, share)
-    return None
-
-
 def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> float | None:
     """Measure the gaps between tags, of their side, by the homography; None if they are the profile's.
 
@@ -290,15 +260,6 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
     variance = found.fun / (2 * len(flat) - 9)
     is_other = misfit(board.gap_share) - found.fun > _GAP_SIGMAS**2 * variance
     return float(found.x) if is_other and abs(found.x - board.gap_share) > _MAX_GAP_OFF else None
-
-
-def _other_spacing(board: Board, share: float) -> Refusal:
-    """Refuse a board whose gaps or markers are wider or narrower than the profile's."""
-    if board.type == "aprilgrid":
-        figures = {"part": "gaps between tags", "unit": "a tag", "key": "tag_spacing"}
-        return IMAGE_OTHER_SPACING.refusal(**figures, share=round(share, 3), stated=board.gap_share)
-    figures = {"part": "markers", "unit": "a square", "key": "marker_m"}
-    return IMAGE_OTHER_SPACING.refusal(**figures, share=round(share, 2), stated=board.marker_share)
 
 
 def _readings(board: Board) -> Iterator[tuple[Markers, int, bool]]:
