@@ -1,6 +1,5 @@
 """`lce-rig calibrate`: estimate the extrinsics of a session, judge them and write them as files."""
 
-import math
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -20,82 +19,51 @@ from lce_rig.cli.options import (
     split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
-from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, SceneOpinion
+from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.core.geometry import sigma_sizes
-from lce_rig.core.phrasing import motion_words, sizes
+from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
+from lce_rig.show.tables import result_tables
 
 _AXES = ("x right", "y down", "z forward")
 _AXES_OF_LIDAR = ("x forward", "y left", "z up")
-_OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
-_UNITS = {"deg": "deg", "m": "mm"}
 _CORRECTED = {"verdict.intrinsics", "verdict.scale"}
 # Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
 _N_REASONS, _FAR_M = 3, 10.0
 
 
-def residual_words(metrics: Metrics, c: Calibration, held_out: str = "") -> str:
+def residual_words(metrics: Metrics, c: Calibration) -> str:
     """Write mean residuals; two LiDARs have none of corners."""
     corners = "" if c.is_of_lidars else f", corners {metrics.reprojection_px:.2f} px"
-    return f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm{held_out}{corners}"
+    return f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm{corners}"
 
 
-def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
-    """State the standard deviations, by axis if the result passes, and for points at distances."""
+def _uncertainty(c: Calibration) -> Iterator[str]:
+    """State the standard deviations, by axis if the result passes, and for a point at a distance."""
     yield _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)
-    if c.verdict == "fail" and not is_explained:
+    if c.verdict == "fail":
         return
     names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
     along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
     by_axis = (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm"))
-    for title, values, digits, unit in by_axis if is_explained or c.verdict == "pass" else ():
+    for title, values, digits, unit in by_axis if c.verdict == "pass" else ():
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
-    if not is_explained:
-        for point in c.uncertainty:
-            if point.distance_m == _FAR_M:
-                off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
-                yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
-        return
-    rows = {
-        "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
-        "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
-        "  in corner": [f"{e.corner_px:.1f} px, {100 * e.corner_m:.1f} cm" for e in c.uncertainty],
-    }
-    for title, cells in rows.items() if c.uncertainty else ():
-        yield f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
+    for point in c.uncertainty:
+        if point.distance_m == _FAR_M:
+            off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
+            yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
 
 
 def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
     return f"  uncertainty  {sizes(sigma_deg, sigma_m)} (1 sigma)"
-
-
-def scene_texts(opinion: SceneOpinion) -> list[str]:
-    """State the scene's opinion: what contradicts, which changes it would see, and what it cannot tell."""
-    if not opinion.n_captures:
-        return ["cannot tell: no capture has a frame and a scan"]
-    edges = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
-    if not opinion.axes:
-        return [f"cannot tell: too few edges ({edges})"]
-    texts = [f"{_OPINIONS[opinion.state]} ({edges})"]
-    texts += [
-        f"{motion_words(axis.axis)}: {show.amount(axis.change, axis.unit, '+')} +- "
-        f"{show.amount(axis.sigma, axis.unit)} {_UNITS[axis.unit]}"
-        for axis in opinion.of("changed")
-    ]
-    smallest = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("unchanged")}
-    texts += [f"would see changes {kind}" for kind in show.axes_by_kind(smallest)]
-    if opinion.state != "unknown" and opinion.of("unknown"):
-        blind = show.axes_by_kind({axis.axis: "" for axis in opinion.of("unknown")})
-        texts.append(f"cannot tell changes {'; '.join(blind)}")
-    return texts
 
 
 def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> Iterator[str]:
@@ -336,13 +304,13 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     used = f"{len(c.captures_used)} of {c.n_captures} captures used"
     yield f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
-    reasons = [finding for finding in c.findings if finding.severity != "note"]
     # A line counts those that are not shown.
     n_shown = _N_REASONS if len(causes) <= _N_REASONS else _N_REASONS - 1
     advised: set[str] = set()
-    for finding in reasons if is_explained else causes[:n_shown]:
+    for finding in c.findings if is_explained else causes[:n_shown]:
         follows = "follows: " if finding.code in following else ""
-        yield f"  [{colour}]{follows}{show.escape(finding.text)}[/]"
+        tint = "none" if finding.severity == "note" else colour
+        yield f"  [{tint}]{follows}{show.escape(finding.text)}[/]"
         advice = "" if follows else advice_of(finding, plan, path)
         if advice and advice not in advised:
             yield f"    -> {show.escape(advice)}"
@@ -356,54 +324,14 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
         target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
         yield show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
         yield from show.matrix_lines(c.T_cam_lidar, "    ")
-    yield from _uncertainty(c, is_explained=is_explained)
+    yield from _uncertainty(c)
     # Lens and squares that the result has corrected go with its extrinsics.
     corrected = [each for each in c.findings if each.code in _CORRECTED and each.severity == "note"]
     if corrected and c.verdict == "pass" and not is_explained:
         yield f"  {show.escape(corrected[0].text)}"
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         yield f"  reference    error {sizes(c.egt_rotation_deg, c.egt_translation_m)}"
-    if is_explained:
-        yield from _explanation(c)
-
-
-def _explanation(c: Calibration) -> Iterator[str]:
-    """State residuals, certificate, channels, cameras, the scene, unused captures and notes."""
-    held_out = f", held out {1000 * c.held_out_m:.1f} mm" if math.isfinite(c.held_out_m) else ""
-    certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
-    certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
-    certificate += f", gap {c.certificate.gap:.0e}"
-    yield f"  detected     board found by both sensors in {c.n_detected}"
-    yield f"  residuals    {residual_words(c.metrics, c, held_out)}"
-    yield f"  certificate  {certificate}"
-    yield from show.titled_lines("channels", _channel_texts(c))
-    figures = c.diagnostics
-    if c.estimated_with:
-        alone = ""
-        if math.isfinite(figures.alone_sigma_rotation_deg):
-            alone = sizes(figures.alone_sigma_rotation_deg, figures.alone_sigma_translation_m)
-            alone = f"; uncertainty alone {alone}"
-        yield f"  together     with {', '.join(c.estimated_with)}{alone}"
-    yield from show.titled_lines("scene", [] if c.scene is None else scene_texts(c.scene))
-    for name, why in c.captures_refused.items():
-        yield f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]"
-    for note in c.findings:
-        if note.severity == "note":
-            yield f"  {show.escape(note.sentence)}"
-
-
-def _channel_texts(calibration: Calibration) -> list[str]:
-    """State what each channel contributes if there are several, or if boards moved."""
-    results = calibration.channel_results
-    if len(results) == 1 and results[0].time_offset_s is None:
-        return []
-    texts = []
-    for result in results:
-        text = f"{result.channel}: {result.n_captures} captures, corner noise {result.noise_px:.2f} px"
-        if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
-            text += (
-                f", time offset {1000 * result.time_offset_s:+.0f} +- "
-                f"{1000 * result.time_offset_sigma_s:.0f} ms"
-            )
-        texts.append(text)
-    return texts
+    for table in result_tables(c).values() if is_explained else ():
+        if table.rows:
+            yield f"\n[bold]{show.escape(table.title)}[/]"
+            yield show.text_table(table)

@@ -1,10 +1,10 @@
 """`lce-rig drift`: compare deployed extrinsics with the edges of a scene, exit by what they say."""
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -22,6 +22,7 @@ from lce_rig.pipeline.watch_drift import drift_live
 from lce_rig.rig import Rig, load_rig
 from lce_rig.scene.findings import STATES
 from lce_rig.show.screen.keys import controls
+from lce_rig.show.tables import axis_table
 
 
 @click.command()
@@ -116,11 +117,8 @@ def _watch_live(rig: Rig, saved: ResultFile, seconds: float | None) -> DriftRepo
         return drift_live(rig, saved, open_live(rig), is_over=is_over)
 
 
-# Along such an axis there is no best fit, and so no change that would have been seen.
-_WITHOUT_FIT = ("scene.flat", "scene.no_peak")
 _COLOURS: dict[State, str] = {"unchanged": "green", "changed": "red", "unknown": "yellow"}
-_TITLES: dict[State, str] = {"changed": "changed", "unknown": "cannot tell", "unchanged": "would see"}
-# Of one axis or one opinion; the lines by state name the axes already.
+# Of one axis or one opinion; the table names the axes already.
 _OF_AXES = (
     "scene.axis_unchanged",
     "scene.axis_changed",
@@ -137,21 +135,12 @@ def _sensors(pair: PairDrift) -> str:
     return f"{pair.calibration.camera}, {pair.calibration.lidar}"
 
 
-def _parts(pair: PairDrift) -> Iterator[str]:
-    """State the verdict, the axes by their state, further causes, and one action."""
+def _parts(pair: PairDrift) -> Iterator[Any]:
+    """State the verdict, each axis, further causes, and one action."""
     data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     data += "" if pair.board is None else f", {show.counted(pair.board.n_boards, 'board')}"
     yield f"[bold]{_sensors(pair)}[/]: [{_COLOURS[pair.state]}]{STATES[pair.state]}[/] ({data})"
-    opinions = [_opinion(pair, index) for index in range(len(pair.drift.axes))]
-    for state, title in _TITLES.items():
-        if state != pair.state or state != "unknown" or len(set(pair.states.values())) > 1:
-            column = {"changed": 0, "unchanged": 1}.get(state)
-            figures = {
-                each.axis: "" if column is None else _figures(each)[column]
-                for each in opinions
-                if each.state == state
-            }
-            yield from show.titled_lines(title, show.axes_by_kind(figures))
+    yield show.text_table(axis_table("", [_opinion(pair, index) for index in range(len(pair.drift.axes))]))
     # With a board, the verdict on both stands for the scene's own.
     omitted = {pair.summary.code, *(_OF_SCENE if pair.board is not None else ())}
     for finding in pair.findings:
@@ -172,11 +161,3 @@ def _opinion(pair: PairDrift, index: int) -> AxisDrift:
     deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
     best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
     return replace(best, state=state)
-
-
-def _figures(axis: AxisDrift | None) -> tuple[str, str]:
-    """Write the change that fits best, and the smallest that would have been seen."""
-    if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
-        return "-", "-"
-    best = f"{show.amount(axis.change, axis.unit, '+')} +- {show.amount(axis.sigma, axis.unit)}"
-    return best, show.amount(axis.smallest, axis.unit).replace("?", "-")

@@ -1,19 +1,22 @@
 """Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
 
 import json
-import math
 import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+import yaml
 
 from lce_rig.core.findings import Finding
+
+if TYPE_CHECKING:
+    from lce_rig.show.tables import Table
 
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
@@ -73,14 +76,6 @@ def cause_lines(cause: str, action: str, colour: str = "none") -> list[str]:
     return [f"  [{colour}]{escape(cause)}[/]", f"    -> {escape(action)}"]
 
 
-def titled_lines(title: str, texts: Sequence[str]) -> list[str]:
-    """Write texts beside their title, on one line if they fit a terminal's 80 columns."""
-    line = f"  {title:<13}{'; '.join(texts)}"
-    if len(line) <= _WIDTH:
-        return [line] if texts else []
-    return [f"  {'' if k else title:<13}{text}" for k, text in enumerate(texts)]
-
-
 def name_next(verb: str, session: Path, options: str = "") -> None:
     """Name the verb to type next on stderr."""
     note(f"  next         {command(verb, session, options)}")
@@ -109,42 +104,9 @@ def print_json(document: Any) -> None:
 
 
 def print_figures(document: Any) -> None:
-    """Print every figure of what `print_json` prints, for people: to five digits, like records as a table."""
+    """Print every figure of what `print_json` prints, for people: as YAML, to five digits."""
     rounded = json.loads(_as_json(document), parse_float=lambda text: float(f"{float(text):.5g}"))
-    for line in _figure_lines(rounded):
-        click.echo(line.rstrip())
-
-
-def _figure_lines(document: Any, indent: str = "") -> Iterator[str]:
-    """Lay out a mapping or list, each level indented; records that hold no others become rows of a table."""
-
-    def text(value: Any) -> str:
-        return ", ".join(map(text, value)) if isinstance(value, list) else "" if value is None else str(value)
-
-    def holds(value: Any, kinds: Any) -> bool:
-        return any(isinstance(item, kinds) for item in (value.values() if isinstance(value, dict) else value))
-
-    named = document.items() if isinstance(document, dict) else [("-", item) for item in document]
-    records = [(str(name), value) for name, value in named]
-    is_table = len(records) > 1 and all(
-        isinstance(value, dict) and not holds(value, dict) and len(value) > 1 for _, value in records
-    )
-    if is_table:
-        keys = list(dict.fromkeys(key for _, value in records for key in value))
-        rows = [["", *keys], *([name, *(text(value.get(key)) for key in keys)] for name, value in records)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        for row in rows:
-            yield indent + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
-        return
-    for name, value in records:
-        is_long = isinstance(value, list) and any(" " in item for item in value if isinstance(item, str))
-        if isinstance(value, dict) or (isinstance(value, list) and (is_long or holds(value, (dict, list)))):
-            yield f"{indent}{name}:"
-            yield from _figure_lines(value, indent + "  ")
-        else:
-            yield from textwrap.wrap(
-                f"{name}: {text(value)}", 100, initial_indent=indent, subsequent_indent=indent + "  "
-            )
+    click.echo(yaml.safe_dump(rounded, sort_keys=False, default_flow_style=None, width=100), nl=False)
 
 
 def _as_json(document: Any) -> str:
@@ -165,6 +127,7 @@ def plain_table(title: str, *headings: str, rows: Iterable[Iterable[str]] = ()) 
     table = Table(
         title=title or None,
         title_justify="left",
+        show_header=any(heading.strip(">") for heading in headings),
         pad_edge=False,
         box=None,
         header_style="bold",
@@ -177,31 +140,16 @@ def plain_table(title: str, *headings: str, rows: Iterable[Iterable[str]] = ()) 
     return table
 
 
+def text_table(table: "Table") -> Any:
+    """Make a rich table of the rows of a result's table."""
+    texts, figures = table.headings[: table.n_texts], table.headings[table.n_texts :]
+    rows = (map(escape, row) for row in table.rows)
+    return plain_table("", *texts, *(f">{heading}" for heading in figures), rows=rows)
+
+
 def matrix_lines(T: Any, indent: str) -> list[str]:
     """Write the upper three rows of a pose."""
     return [indent + "  ".join(f"{value: .6f}" for value in row) for row in T[:3]]
-
-
-def amount(value: float | None, unit: str, sign: str = "") -> str:
-    """Write a rotation in deg, or a translation (m) in mm, without the unit; "?" where it is not known."""
-    if value is None or not math.isfinite(value):
-        return "?"
-    return f"{value:{sign}.2f}" if unit == "deg" else f"{1000 * value:{sign}.0f}"
-
-
-def axes_by_kind(figures: Mapping[str, str]) -> list[str]:
-    """Write axes as rotations about and translations along x, y and z.
-
-    Args:
-        figures: by axis, "translation_x" to "rotation_z", in deg and mm; "" for none.
-    """
-    parts = []
-    for kind, word, unit in (("rotation", "about", "deg"), ("translation", "along", "mm")):
-        chosen = {axis[-1]: figure for axis, figure in figures.items() if axis.startswith(kind)}
-        if chosen:
-            names = ", ".join(f"{axis} {figure}".strip() for axis, figure in chosen.items())
-            parts.append(f"{word} {names} {unit}" if any(chosen.values()) else f"{word} {names}")
-    return parts
 
 
 def print_table(table: Any) -> None:

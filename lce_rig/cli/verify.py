@@ -8,7 +8,7 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.calibrate import exit_by_verdict, residual_words, scene_texts
+from lce_rig.cli.calibrate import exit_by_verdict, residual_words
 from lce_rig.cli.options import explain_option, json_option, path_option, result_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
@@ -18,6 +18,7 @@ from lce_rig.judge.session_check import SessionCheck
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import profile_behind
 from lce_rig.show.overlays.view_3d import CameraIn3D, CaptureIn3D, draw_picture, show_window
+from lce_rig.show.tables import scene_words
 
 
 @click.command()
@@ -93,9 +94,8 @@ def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterat
         yield from show.cause_lines(each.text, each.advice_at(session), tint)
     if checked.metrics is not None:
         yield f"  residuals    {residual_words(checked.metrics, c)} (means)"
-    scene = scene_texts(checked.scene)
     if checked.scene.state != "unknown" or is_explained:
-        yield from show.titled_lines("scene", scene if is_explained else scene[:1])
+        yield f"  scene        {scene_words(checked.scene)}"
     if checked.page is not None:
         yield f"  images       {show.escape(str(checked.page))}"
 

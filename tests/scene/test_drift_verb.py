@@ -48,9 +48,11 @@ def test_unchanged_exits_with_0_and_draws(room, tmp_path, capsys):
 def test_changed_exits_with_7_and_names_the_axis(room, turned, capsys):
     assert run(["drift", str(room), "--result", str(turned)]) == 7
     captured = capsys.readouterr()
-    assert len(captured.out.splitlines()) <= 6
-    changed = next(line for line in captured.out.splitlines() if line.split()[:1] == ["changed"])
-    assert " y " in changed and "deg" in changed
+    assert len(captured.out.splitlines()) <= 10
+    axes = [line for line in captured.out.splitlines() if line.startswith(("along ", "about "))]
+    assert len(axes) == 6 and ["about y down" in line for line in axes] == [
+        " changed " in line for line in axes
+    ]
 
 
 def test_a_folder_is_compared_as_a_session_is(room, seen, turned, tmp_path):

@@ -183,14 +183,3 @@ def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
     axes.plot(*evidence.corners_px[::every].T, ".", color=FAINT, markersize=1)
     add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
     return drawing(figure, "Residuals of the corners in the image")
-
-
-def principal_axes(cov: Array) -> tuple[Array, Array]:
-    """Find the standard deviations (3,) along the principal axes (3, 3), columns, the largest first."""
-    variances, directions = np.linalg.eigh(cov)
-    order = np.argsort(variances)[::-1]
-    directions = directions[:, order]
-    # Eigenvectors have no sign of their own.
-    largest = np.abs(directions).argmax(axis=0)
-    directions = directions * np.sign(directions[largest, range(3)])
-    return np.sqrt(np.maximum(variances[order], 0)), directions

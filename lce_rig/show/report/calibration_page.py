@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import math
 import os
 import shlex
 from collections.abc import Mapping, Sequence
@@ -20,22 +19,19 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.phrasing import as_line, significant, sizes
+from lce_rig.core.geometry import Array
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
-from lce_rig.export.writing import T_BODY_OPTICAL, rpy
-from lce_rig.judge.findings import advice_of, cause_words, consequences
+from lce_rig.judge.findings import advice_of, consequences
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.overlays.canvas import accumulated
-from lce_rig.show.page import as_markup, render, style
+from lce_rig.show.page import render, style
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
+from lce_rig.show.tables import result_tables, scene_words
 
-Row = Sequence[object]
-_STEP = 1e-6
-_AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
@@ -97,24 +93,15 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
     """List the content of one camera and one LiDAR's part of the page, by the template's names."""
     board, lens = rig.board.to_board(), None if c.is_of_lidars else rig.lens_of(c)
     evidence = None if lens is None else gather(c, board, lens)
-    captures = []
-    for k, residual in enumerate(c.residuals):
-        figures = [
-            ("planes", 1000 * residual.plane_mean_m, "mm"),
-            ("edges", 1000 * residual.edge_mean_m, "mm"),
-            ("held out", 1000 * residual.held_out_m, "mm"),
-            ("corners", residual.reprojection_px, "px"),
-        ]
-        captures.append(
-            {
-                "name": residual.capture,
-                "anchor": f"{anchor}-capture-{k}",
-                "figures": [
-                    (name, f"{value:.{1 if unit == 'mm' else 2}f} {unit}" if math.isfinite(value) else "")
-                    for name, value, unit in figures
-                ],
-            }
-        )
+    tables = result_tables(c)
+    captures = [
+        {
+            "name": name,
+            "anchor": f"{anchor}-capture-{k}",
+            "figures": list(zip(tables["captures"].headings[1:], figures, strict=True)),
+        }
+        for k, (name, *figures) in enumerate(tables["captures"].rows)
+    ]
     return {
         "calibration": c,
         "anchor": anchor,
@@ -124,30 +111,10 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
             rig.lidars[c.lidar].frame,
             (rig.lidars if lens is None else rig.cameras)[c.camera].frame,
         ),
-        "pose": _pose_rows(c),
-        "uncertainty": [
-            (
-                f"{p.distance_m:g} m",
-                f"{p.centre_px:.1f} px, {100 * p.centre_m:.1f} cm",
-                f"{p.corner_px:.1f} px, {100 * p.corner_m:.1f} cm",
-            )
-            for p in c.uncertainty
-        ],
-        "axes": [*_axis_rows(c.cov[3:, 3:], "deg", "about"), *_axis_rows(c.cov[:3, :3], "mm", "along")],
-        "causes": [
-            (
-                cause_words(cause.source),
-                f"{cause.sigma_rotation_deg:.3f}",
-                f"{1000 * cause.sigma_translation_m:.1f}",
-            )
-            for cause in c.contributions
-        ],
+        "tables": tables,
         "captures": captures,
-        "clocks": _clock_rows(c),
         "lens": [finding.text for finding in c.findings if finding.code in _LENS_CODES],
-        "scene": _scene_rows(c),
-        "cameras": _camera_rows(c),
-        "refused": [(name, why.stage, as_markup(why.sentence)) for name, why in c.captures_refused.items()],
+        "scene": "" if c.scene is None else as_line(scene_words(c.scene)),
         "drawings": _drawings(c, board, lens, evidence, anchor),
     }
 
@@ -251,85 +218,6 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
         f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
         *optional,
     ]
-
-
-def _pose_rows(c: Calibration) -> list[Row]:
-    """State the pose of the camera's body in the LiDAR's frame, or of two LiDARs the second's in the first's.
-
-    Standard deviations belong to it.
-    """
-
-    def pose(tangent: Array) -> Array:
-        T = perturb(c.T_cam_lidar, tangent)
-        T = T if c.is_of_lidars else invert(T) @ invert(T_BODY_OPTICAL)
-        return np.concatenate([T[:3, 3], rpy(T[:3, :3])])
-
-    moved = np.array([pose(step) - pose(-step) for step in _STEP * np.eye(6)]).T
-    moved[3:] = (moved[3:] + np.pi) % (2 * np.pi) - np.pi
-    J = moved / (2 * _STEP)
-    values, sigmas = pose(np.zeros(6)), np.sqrt(np.diag(J @ c.cov @ J.T))
-    rows: list[Row] = [
-        (name, f"{value:+.4f} m", f"{1000 * sigma:.1f} mm")
-        for name, value, sigma in zip(("x", "y", "z"), values[:3], sigmas[:3], strict=True)
-    ]
-    rows += [
-        (name, f"{value:+.3f} deg", f"{sigma:.3f} deg")
-        for name, value, sigma in zip(
-            ("roll", "pitch", "yaw"), np.degrees(values[3:]), np.degrees(sigmas[3:]), strict=True
-        )
-    ]
-    return rows
-
-
-def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
-    """State the principal axes of a covariance (3, 3) in rad^2 or m^2."""
-    sigmas, directions = drawings.principal_axes(cov)
-    sizes = [f"{np.degrees(s):.3f} deg" if unit == "deg" else f"{1000 * s:.1f} mm" for s in sigmas]
-    return [
-        (kind, "(" + ", ".join(f"{value + 0.0:+.2f}" for value in direction) + ")", size)
-        for size, direction in zip(sizes, directions.T, strict=True)
-    ]
-
-
-def _clock_rows(c: Calibration) -> list[Row]:
-    """List figures of the channels, a column each; none where one channel saw still boards."""
-    if len(c.channel_results) < 2 and all(r.time_offset_s is None for r in c.channel_results):
-        return []
-    offsets = [
-        "boards stood still"
-        if r.time_offset_s is None or r.time_offset_sigma_s is None
-        else f"{1000 * r.time_offset_s:+.0f} ± {1000 * r.time_offset_sigma_s:.0f} ms"
-        for r in c.channel_results
-    ]
-    return [
-        ("captures", *(r.n_captures for r in c.channel_results)),
-        ("corner noise", *(f"{r.noise_px:.2f} px" for r in c.channel_results)),
-        ("time offset", *offsets),
-    ]
-
-
-def _scene_rows(c: Calibration) -> list[Row]:
-    states = {"unchanged": "agrees", "changed": "contradicts", "unknown": "cannot tell"}
-    rows: list[Row] = []
-    for axis in () if c.scene is None else c.scene.axes:
-        scale, digits, unit = (1.0, 2, "deg") if axis.unit == "deg" else (1000.0, 0, "mm")
-        smallest = "none" if math.isinf(axis.smallest) else f"{scale * axis.smallest:.{digits}f} {unit}"
-        change = f"{scale * axis.change:+.{digits}f} ± {scale * axis.sigma:.{digits}f} {unit}"
-        kind = "about" if axis.unit == "deg" else "along"
-        rows.append((f"{kind} {_AXES[axis.axis[-1]]}", states[axis.state], change, smallest))
-    return rows
-
-
-def _camera_rows(c: Calibration) -> list[Row]:
-    rows: list[Row] = []
-    for other in c.other_cameras:
-        sigma = apart = ""
-        if other.cov is not None:
-            sigma = sizes(*sigma_sizes(other.cov))
-        if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
-            apart = sizes(other.apart_rotation_deg, other.apart_translation_m)
-        rows.append((other.camera, other.n_captures, sigma, apart, f"{1000 * other.board_rms_m:.1f} mm"))
-    return rows
 
 
 _MOST_PX, _QUALITY, _OUTLINE_BGR = 320, 60, (0, 140, 255)
