@@ -57,7 +57,7 @@ def find_contradictions(
             yield Sensitivity("scale", 1.0, scale[0] * squares.moves)
     if of_source and pattern is not None:
         yield Sensitivity("pattern", 1.0, pattern[0][None] @ of_source["pattern_offset"].moves)
-    for contrast in objections(contrasts, target, rig.verdict):
+    for contrast in objections(contrasts, target):
         # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
         # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF

@@ -140,6 +140,10 @@ def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=rank))
 
 
+FAIL_FACTOR = 3.0
+"""A standard deviation, or a difference of two results, of this many targets fails."""
+
+
 def failing(is_fail: bool) -> Severity:
     """Return the severity of a finding that prevents a pass: an error if the result fails by it."""
     return "error" if is_fail else "warning"

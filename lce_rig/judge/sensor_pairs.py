@@ -36,6 +36,7 @@ from lce_rig.detect.detection import LidarDetection
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
     CAMERAS_EXCHANGED,
+    FAIL_FACTOR,
     LIDARS_DIFFER,
     LIDARS_EXCHANGED,
     LIDARS_UNNAMED,
@@ -45,7 +46,7 @@ from lce_rig.judge.findings import (
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig, VerdictSettings
+from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig
 
 # Fewer placements do not determine the scatter.
 _MIN_PLACEMENTS = 4
@@ -251,31 +252,26 @@ def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEv
     return named - chi2(first, nominal[1]) - chi2(second, nominal[0])
 
 
-def camera_findings(
-    pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
-) -> list[Finding]:
+def camera_findings(pair: CameraPair, names: tuple[str, str], target: CalibrationSettings) -> list[Finding]:
     """Find contradictions between the extrinsics of two cameras and their images.
 
     Args:
         pair: the cameras.
         names: of the first and the second.
         target: standard deviations to reach.
-        limits: of the profile.
     """
     if pair.from_images is None or pair.apart is None:
         return []
-    # Images are accurate enough to show any relevant change.
-    strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
     halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
     cameras = " to ".join(names)
-    findings = split_findings(halves, pair.from_images.captures, target, strict, cameras)
+    findings = split_findings(halves, pair.from_images.captures, target, cameras)
     images_rms_m = pair.from_images.board_rms_m
-    excess = target.excess(pair.apart) / limits.max_camera_difference
+    excess = target.excess(pair.apart)
     if excess > 1:
         findings.append(
             CAMERAS_DIFFER(
                 cameras,
-                severity=failing(excess > limits.fail_factor),
+                severity=failing(excess > FAIL_FACTOR),
                 rms_m=pair.board_rms_m,
                 images_rms_m=images_rms_m,
                 **pair.apart.sizes,
@@ -344,10 +340,10 @@ def loop_findings(between: Calibration, first: Calibration, second: Calibration,
     cov = by_first @ first.cov @ by_first.T + by_between @ between.cov @ by_between.T + second.cov
     tangent = difference(first.T_cam_lidar @ between.T_cam_lidar, second.T_cam_lidar)
     apart = PoseDifference(tangent, cov)
-    excess = rig.calibration.excess(apart) / rig.verdict.max_camera_difference
+    excess = rig.calibration.excess(apart)
     if excess <= 1:
         return []
-    severity = failing(excess > rig.verdict.fail_factor)
+    severity = failing(excess > FAIL_FACTOR)
     return [
         LIDARS_DIFFER(
             f"{between.camera} and {between.lidar}", severity=severity, camera=first.camera, **apart.sizes

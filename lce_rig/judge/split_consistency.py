@@ -23,8 +23,14 @@ from lce_rig.judge.findings import (
     TWO_GROUPS,
     failing,
 )
-from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.rig import CalibrationSettings
 
+LEAST_CHANCE = 0.001
+"""A difference of subsets of the captures is significant below this probability."""
+# Largest differences of subsets, in targets: of earlier and later captures, of two cameras' relative pose by
+# images, which are accurate enough to show any relevant change, and of boards at two places or two groups of
+# captures, which nearly cancel in the whole.
+_MAX_CHANGE, _MAX_OF_CAMERAS, _MAX_CONTRAST = 1.5, 1.0, 2.5
 # Fewer placements are not split.
 _MIN_PLACEMENTS = 6
 _MIN_SHARE = 3
@@ -116,12 +122,12 @@ class Contrast:
         n = self.n_first if self.is_change else 0
         return captures[:n] if 2 * n < len(captures) else captures[n:]
 
-    def excess(self, target: CalibrationSettings, limits: VerdictSettings) -> float:
+    def excess(self, target: CalibrationSettings, max_change: float = _MAX_CHANGE) -> float:
         """Measure the difference in units of its limit; 0 if random subsets may differ as much."""
-        if self.chance > limits.least_chance:
+        if self.chance > LEAST_CHANCE:
             return 0.0
-        limit = limits.max_change if self.is_change else limits.max_contrast
-        if self.group and (self.is_noise_known or self.chance < _CERTAIN * limits.least_chance):
+        limit = max_change if self.is_change else _MAX_CONTRAST
+        if self.group and (self.is_noise_known or self.chance < _CERTAIN * LEAST_CHANCE):
             limit = 1.0
         return target.in_targets(*tangent_sizes(self.apart)) / limit
 
@@ -384,7 +390,7 @@ def _chi2(expansion: Quadratics, shares: Array, among: Array | None = None) -> t
 
 
 def objections(
-    contrasts: Sequence[Contrast], target: CalibrationSettings, limits: VerdictSettings
+    contrasts: Sequence[Contrast], target: CalibrationSettings, max_change: float = _MAX_CHANGE
 ) -> list[Contrast]:
     """List the subsets that differ significantly and by more than their limit.
 
@@ -393,7 +399,7 @@ def objections(
     significantly than earlier and later ones, a constant error of lens, board or ranges is the cause, and no
     sensor moved.
     """
-    found = sorted((c for c in contrasts if c.excess(target, limits) > 1), key=lambda each: each.chance)
+    found = sorted((c for c in contrasts if c.excess(target, max_change) > 1), key=lambda each: each.chance)
     by_place = min((each.chance for each in found if each.is_of_places), default=1.0)
     found = [
         each
@@ -411,7 +417,6 @@ def split_findings(
     contrasts: Sequence[Contrast],
     captures: Sequence[str],
     target: CalibrationSettings,
-    limits: VerdictSettings,
     of_cameras: str = "",
 ) -> list[Finding]:
     """Find subsets that differ by more than the target and significantly more than random ones.
@@ -420,18 +425,18 @@ def split_findings(
         contrasts: see `contrast_halves`.
         captures: names, in the order in which they were taken.
         target: standard deviations to reach.
-        limits: of the profile.
         of_cameras: names of two cameras where their relative pose is compared, not extrinsics.
     """
     findings = []
-    found = objections(contrasts, target, limits)
+    max_change = _MAX_OF_CAMERAS if of_cameras else _MAX_CHANGE
+    found = objections(contrasts, target, max_change)
     # Boards that contradict may be far, at the left and low: the places that differ most tell of them all.
     of_places = [each for each in found if each.is_of_places]
-    others = sorted(of_places, key=lambda each: each.excess(target, limits))[:-1]
+    others = sorted(of_places, key=lambda each: each.excess(target))[:-1]
     for c in found:
         if c in others:
             continue
-        severity = failing(c.excess(target, limits) > _FAIL)
+        severity = failing(c.excess(target, max_change) > _FAIL)
         rotation_deg, translation_m = tangent_sizes(c.apart)
         apart: dict[str, Any] = {
             "rotation_deg": rotation_deg,

@@ -38,6 +38,7 @@ from lce_rig.judge.local_quadratic import (
     scale_of,
 )
 from lce_rig.judge.split_consistency import (
+    LEAST_CHANCE,
     MEDIAN_CHI2,
     Contrast,
     RejectedGroup,
@@ -134,7 +135,7 @@ def validate(
             # Neither chance nor the profile's deviation explains an offset that contradicts it.
             cov = pattern[1] + rig.board.pattern_offset_sigma_m**2 * np.eye(2)
             chi2 = pattern[0] @ np.linalg.solve(cov, pattern[0])
-            pattern = pattern if np.exp(-chi2 / 2) < rig.verdict.least_chance else None
+            pattern = pattern if np.exp(-chi2 / 2) < LEAST_CHANCE else None
         # A wrong place of the pattern would look like captures that differ.
         settled = expansion.hold((SCALE,) if pattern is not None else OF_PROFILE).settled()
         if own_cost is not None and recount is not None:
@@ -147,9 +148,7 @@ def validate(
             contrasts += find_turned(estimate.turns, centres, settled.groups)
         # Captures of another mounting would look like other angles.
         apart = {
-            name
-            for each in objections(contrasts, rig.calibration, rig.verdict)
-            for name in each.minority(estimate.used)
+            name for each in objections(contrasts, rig.calibration) for name in each.minority(estimate.used)
         }
         agreeing = [observation for observation in observations if observation.capture not in apart]
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:

@@ -18,6 +18,7 @@ from lce_rig.judge.findings import (
     CHANGED,
     CHANNELS_DIFFER,
     EDGE_RESIDUAL,
+    FAIL_FACTOR,
     FAR_FROM_NOMINAL,
     FEW_PLACEMENTS,
     FEW_USED,
@@ -55,8 +56,11 @@ _UPRIGHT = 0.87
 # Shares of scans without one of two edges, and of ring ends off the outline. Of 15 sessions with the right
 # size one lacks edges, by its mounting, and drops none; one drops as many, at hands, and lacks none.
 _LACKING, _DROPPED = 0.3, 0.04
-# Scales differ beyond this many standard deviations, and fail beyond this many limits.
-_SURE, _SCALE_FAIL = 3.0, 2.5
+# Camera and LiDAR distances differ beyond this share and so many standard deviations, and fail beyond so many
+# limits.
+_MAX_SCALE_ERROR, _SURE, _SCALE_FAIL = 0.008, 3.0, 2.5
+MAX_PLANE_MISFIT_M = 0.012
+"""Of both sensors' planes, rms: still boards stay below 8 mm, hand-held ones reach 20 to 30 mm."""
 # A contradiction of the scene by so many standard deviations fails; from three it is told.
 SCENE_FAILS = 5.0
 
@@ -96,11 +100,11 @@ def judge(
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
-        *_scale(examination.scale, board, rig.verdict.max_scale_error),
+        *_scale(examination.scale, board),
         *_pattern(examination.pattern, len(estimate.used)),
-        *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
+        *split_findings(examination.contrasts, examination.captures, rig.calibration),
         *others,
-        *_motion(estimate, rig.verdict.max_plane_misfit_m),
+        *_motion(estimate),
         *_channels(estimate, rig),
         *residuals_beyond(estimate.metrics, rig.quality),
         *_captures(estimate, n_captures, rig.quality),
@@ -234,7 +238,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
         }
         yield kind(
             # A contradiction is judged by the check that found it; here it says how wrong the result may be.
-            severity=failing(agreed > rig.verdict.fail_factor * goal),
+            severity=failing(agreed > FAIL_FACTOR * goal),
             action="measure_ranges"
             if is_of_lidar
             else measure_action(largest(examination.contributions, size)),
@@ -254,11 +258,11 @@ def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]
     ]
 
 
-def _scale(scale: tuple[float, float] | None, board: Board, limit: float) -> list[Finding]:
+def _scale(scale: tuple[float, float] | None, board: Board) -> list[Finding]:
     """Compare the camera's distances with the LiDAR's."""
-    if scale is None or abs(scale[0]) <= max(limit, _SURE * scale[1]):
+    if scale is None or abs(scale[0]) <= max(_MAX_SCALE_ERROR, _SURE * scale[1]):
         return []
-    is_fail = abs(scale[0]) - _SURE * scale[1] > _SCALE_FAIL * limit
+    is_fail = abs(scale[0]) - _SURE * scale[1] > _SCALE_FAIL * _MAX_SCALE_ERROR
     return [
         SCALE_OFF(
             severity=failing(is_fail),
@@ -279,9 +283,9 @@ def _pattern(pattern: tuple[Array, Array] | None, n_captures: int) -> list[Findi
     return [PATTERN_OFFSET(right_m=right_m, up_m=up_m, sigma_m=sigma_m, n_captures=n_captures)]
 
 
-def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:
+def _motion(estimate: CalibrationEstimate) -> list[Finding]:
     rms_m = estimate.diagnostics.fit_plane_rms_m
-    if not rms_m > limit_m:  # NaN where the method has no such residual
+    if not rms_m > MAX_PLANE_MISFIT_M:  # NaN where the method has no such residual
         return []
     is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
     return [PLANES_APART(action="compensated" if is_compensated else "", rms_m=rms_m)]
@@ -293,7 +297,7 @@ def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
     if apart is None or (excess := rig.calibration.excess(apart)) <= 1:
         return []
     first, second = (channel.channel for channel in estimate.channels[:2])
-    severity = failing(excess > rig.verdict.fail_factor)
+    severity = failing(excess > FAIL_FACTOR)
     return [CHANNELS_DIFFER(severity=severity, first=first, second=second, **apart.sizes)]
 
 

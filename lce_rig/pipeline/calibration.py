@@ -317,7 +317,7 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
         # Contradicting captures widen a method's covariance; that must not hide the contradiction.
         pair = relate(one.estimate, other.estimate) if one.is_still and other.is_still else None
         names = one.camera, other.camera
-        findings = [] if pair is None else camera_findings(pair, names, rig.calibration, rig.verdict)
+        findings = [] if pair is None else camera_findings(pair, names, rig.calibration)
         exchanged = find_exchanged_cameras(
             rig, one.lidar, one.evidence(detections), other.evidence(detections)
         )

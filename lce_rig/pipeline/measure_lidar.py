@@ -18,6 +18,7 @@ from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
 from lce_rig.pipeline.detect_session import candidates_of, detect
 from lce_rig.rig import as_yaml, set_value
@@ -98,7 +99,7 @@ def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
     if any(channel.time_offset_s is not None for channel in estimate.channels):
         what = f"{session.path}: the board moved while it was captured"
     else:
-        rms_m, limit_m = estimate.diagnostics.fit_plane_rms_m, session.rig.verdict.max_plane_misfit_m
+        rms_m, limit_m = estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M
         if rms_m <= limit_m:
             return
         what = (

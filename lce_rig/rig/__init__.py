@@ -13,7 +13,7 @@ from lce_rig.rig.sensors import (
     LidarSettings,
     TimestampSettings,
 )
-from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
+from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
 
 __all__ = [
     "BoardSettings",
@@ -28,7 +28,6 @@ __all__ = [
     "QualitySettings",
     "Rig",
     "TimestampSettings",
-    "VerdictSettings",
     "as_yaml",
     "derive_text",
     "dump_rig",

@@ -32,7 +32,7 @@ from lce_rig.rig.settings import (
     require,
 )
 from lce_rig.rig.target_settings import OutputFormat, TargetSettings
-from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
+from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
 
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
 
@@ -242,7 +242,6 @@ class Rig(Settings):
     )
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
-    verdict: VerdictSettings = VerdictSettings()
 
     def lens_of(self, extrinsics: Calibration) -> Intrinsics:
         """Return the intrinsics that belong to extrinsics: their own, else the profile's."""

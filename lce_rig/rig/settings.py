@@ -12,15 +12,7 @@ _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 
 # Keys of earlier versions: profiles that state them are read, and nothing depends on them.
-_RETIRED = {
-    "azimuth_offset_sigma_deg",
-    "control_sigmas",
-    "max_edge_shift_m",
-    "max_held_out_ratio",
-    "max_prior_sigmas",
-    "max_spread_ratio",
-    "reconstruction",
-}
+_RETIRED = {"azimuth_offset_sigma_deg", "reconstruction", "verdict"}
 
 # The meaning of each pattern, for errors.
 PATTERNS = {

@@ -80,28 +80,3 @@ class CalibrationSettings(Settings):
     def excess(self, difference: PoseDifference) -> float:
         """Measure a difference of two poses in units of the targets; 0 where chance explains it."""
         return self.in_targets(**difference.sizes) if difference.is_significant else 0.0
-
-
-class VerdictSettings(Settings):
-    """Limits of the verdict: beyond a first limit a result is marginal, beyond a second limit it fails.
-
-    Attributes:
-        fail_factor: a standard deviation, or a difference of two results, of this many targets fails.
-        max_scale_error: largest relative difference of camera and LiDAR distances; 2.5 times that fails.
-        max_plane_misfit_m: largest rms distance between both sensors' planes; still boards stay below.
-        max_change: largest difference of earlier and later captures, in targets; twice it fails.
-        max_contrast: the same between near and far, left and right, upper and lower boards, and between two
-            groups of captures, whose differences nearly cancel in the whole.
-        max_camera_difference: largest difference of two cameras' relative pose between extrinsics and images,
-            and its largest change during the session, in targets; `fail_factor` times that, or twice for a
-            change, fails.
-        least_chance: a difference of subsets of the captures is significant below this probability.
-    """
-
-    fail_factor: Annotated[float, Field(gt=1, le=1e6)] = 3.0
-    max_scale_error: Positive = 0.008
-    max_plane_misfit_m: Positive = 0.012
-    max_change: Positive = 1.5
-    max_contrast: Positive = 2.5
-    max_camera_difference: Positive = 1.0
-    least_chance: Annotated[float, Field(gt=0, lt=0.5)] = 0.001

@@ -8,12 +8,12 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.judge.sensor_pairs import camera_findings, pose_from_images, relate, shared_boards
-from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
+from lce_rig.rig.thresholds import CalibrationSettings
 from tests.calibrate.boards import BOARD
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, simulate_two
 
 OPTIONS = EstimateSettings(laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
-TARGET, LIMITS = CalibrationSettings(), VerdictSettings()
+TARGET = CalibrationSettings()
 N_SOUND = 21
 TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
 
@@ -29,7 +29,7 @@ def related(session):
 
 
 def findings(pair):
-    return camera_findings(pair, (LEFT, RIGHT), TARGET, LIMITS)
+    return camera_findings(pair, (LEFT, RIGHT), TARGET)
 
 
 @pytest.fixture(scope="module")

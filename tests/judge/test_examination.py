@@ -13,11 +13,11 @@ from lce_rig.judge.split_consistency import contrast_halves, find_groups, find_t
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import judge
 from lce_rig.lens.models import LensPrior
-from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
+from lce_rig.rig import CalibrationSettings, load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
-LIMITS, TARGET = VerdictSettings(), CalibrationSettings()
+TARGET = CalibrationSettings()
 FAST = EstimateSettings("paper")
 # Any method's result lies about as far from the truth.
 T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
@@ -96,7 +96,7 @@ def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severit
     ]
     contrasts = contrast_halves(expanded(nudged).settled(), middles(nudged))
     names = [seen.capture for seen in nudged]
-    findings = split_findings(contrasts[:1], names, TARGET, LIMITS)
+    findings = split_findings(contrasts[:1], names, TARGET)
     assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
     if severity is not None:
         assert abs(contrasts[0].n_first - 12) <= 1
@@ -115,7 +115,7 @@ def test_two_captures_at_an_end_that_agree_on_another_mounting_are_a_change_and_
         for k, seen in enumerate(observed(15, 4))
     ]
     found = contrast_halves(expanded(boards).settled(), middles(boards))
-    findings = split_findings(found[:1], [seen.capture for seen in boards], TARGET, LIMITS)
+    findings = split_findings(found[:1], [seen.capture for seen in boards], TARGET)
     told = [(finding.severity, finding.figures["capture"]) for finding in findings]
     assert told == ([] if cut is None else [("error", f"{cut:06d}")])
 
@@ -129,7 +129,7 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
         for seen, distance_m in zip(boards, distances_m, strict=True)
     ]
     found = contrast_halves(expanded(boards).settled(), middles(boards))
-    findings = split_findings(found, [seen.capture for seen in boards], TARGET, LIMITS)
+    findings = split_findings(found, [seen.capture for seen in boards], TARGET)
     assert any(finding.figures.get("first") == "near" for finding in findings)
 
 
@@ -139,7 +139,7 @@ def test_boards_held_near_first_and_far_later_are_told_by_their_places_and_not_a
     boards = [moved(seen, turn @ seen.image.T_cam_board) if k < 12 else seen for k, seen in enumerate(boards)]
     settled = expanded(boards).settled()
     contrasts = (*contrast_halves(settled, middles(boards)), *find_groups(settled))
-    findings = split_findings(contrasts, [seen.capture for seen in boards], TARGET, LIMITS)
+    findings = split_findings(contrasts, [seen.capture for seen in boards], TARGET)
     assert {finding.code for finding in findings} == {"verdict.shares_differ"}
 
 
@@ -152,7 +152,7 @@ def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest(angle
         for k, seen in enumerate(observed(16, 4))
     ]
     found = find_groups(expanded(nudged).settled())
-    (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET, LIMITS)
+    (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET)
     assert finding.code == "verdict.two_groups"
     assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
     assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in finding.text
@@ -242,8 +242,8 @@ def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
     ]
     settled = expanded(nudged).settled()
     contrasts = (*contrast_halves(settled, middles(nudged)), *find_groups(settled))
-    assert contrasts[-1].excess(TARGET, LIMITS) > 1
-    codes = [each.code for each in split_findings(contrasts, [o.capture for o in nudged], TARGET, LIMITS)]
+    assert contrasts[-1].excess(TARGET) > 1
+    codes = [each.code for each in split_findings(contrasts, [o.capture for o in nudged], TARGET)]
     assert codes == ["verdict.changed"]
 
 

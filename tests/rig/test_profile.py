@@ -279,6 +279,4 @@ def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerb
 
 
 def test_keys_of_earlier_versions_are_read_and_mean_nothing():
-    kept, retired = "max_change: 2", "control_sigmas: 3, max_spread_ratio: 1.2"
-    with_retired = RLFS + f"verdict: {{{retired}, {kept}}}\n"
-    assert parse_rig(with_retired) == parse_rig(RLFS + f"verdict: {{{kept}}}\n")
+    assert parse_rig(RLFS + "verdict: {max_change: 2}\nreconstruction: {}\n") == parse_rig(RLFS)
