@@ -1,16 +1,10 @@
 """A VLP-16 on the network: UDP packets in, scans of one revolution each out.
 
-Many datagrams are taken in one system call: recvmmsg, which Python does not offer. The kernel stamps their
-arrival and counts those that it drops.
-
-References:
-    man 2 recvmmsg, man 3 cmsg
+The kernel stamps the arrival of datagrams and counts those that it drops.
 """
 
 import contextlib
-import ctypes
 import errno
-import os
 import select
 import socket
 import struct
@@ -40,16 +34,13 @@ _GATHER_S = 0.005
 _WANTED_BUFFER_BYTES = 4 << 20
 # What a data packet takes of the buffer: its bytes, and the kernel's own about it.
 _PACKET_COST_BYTES = 2304
-#: Datagrams that are taken in one call: 85 ms of data packets.
-N_AT_ONCE = 64
+# Datagrams that are taken before other threads may run: 85 ms of data packets.
+_MOST_AT_ONCE = 64
 # asm-generic/socket.h; Python names neither.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
-_MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES, _ADDRESS_BYTES = 2048, 256, 16
+_MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES = 2048, 256
 _NS_PER_S = 1_000_000_000
 _TIMESPEC = struct.Struct("@ll")
-_PORT_AND_ADDRESS = struct.Struct("!2xH4s")
-_CONTROL = struct.Struct("@Nii")
-_ALIGN = ctypes.sizeof(ctypes.c_size_t)
 
 
 class Vlp16Source(LiveSource):
@@ -207,26 +198,6 @@ class Vlp16Source(LiveSource):
         return problems
 
 
-class _Vector(ctypes.Structure):
-    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
-
-
-class _MessageHeader(ctypes.Structure):
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_length", ctypes.c_uint32),
-        ("vectors", ctypes.POINTER(_Vector)),
-        ("n_vectors", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_length", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _Message(ctypes.Structure):
-    _fields_ = (("header", _MessageHeader), ("length", ctypes.c_uint32))
-
-
 class UdpPort:
     """An open UDP port; other programs may listen on the same one.
 
@@ -248,16 +219,6 @@ class UdpPort:
         """
         self.port = port
         self.n_overflowed = 0
-        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
-        self._payloads = [ctypes.create_string_buffer(_MAX_PAYLOAD_BYTES) for _ in range(N_AT_ONCE)]
-        self._controls = [ctypes.create_string_buffer(_ANCILLARY_BYTES) for _ in range(N_AT_ONCE)]
-        self._names = [ctypes.create_string_buffer(_ADDRESS_BYTES) for _ in range(N_AT_ONCE)]
-        self._vectors = [_Vector(ctypes.addressof(each), _MAX_PAYLOAD_BYTES) for each in self._payloads]
-        self._messages = (_Message * N_AT_ONCE)()
-        for k, message in enumerate(self._messages):
-            message.header.name = ctypes.addressof(self._names[k])
-            message.header.vectors, message.header.n_vectors = ctypes.pointer(self._vectors[k]), 1
-            message.header.control = ctypes.addressof(self._controls[k])
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -284,42 +245,30 @@ class UdpPort:
         return self._socket.fileno()
 
     def receive_many(self) -> list[Datagram]:
-        """Take the datagrams that came first, N_AT_ONCE at most, in one call; never waits.
-
-        Every call lets other threads run: a thread that takes a datagram at a time falls behind beside one
-        that computes.
+        """Take the datagrams that have come, 64 at most; never waits.
 
         Raises:
             OSError: the network failed.
         """
-        for message in self._messages:
-            message.header.name_length = _ADDRESS_BYTES
-            message.header.control_length = _ANCILLARY_BYTES
-        n_came = self._receive(self._socket.fileno(), self._messages, N_AT_ONCE, socket.MSG_DONTWAIT, None)
-        if n_came < 0:
-            number = ctypes.get_errno()
-            if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR):
-                return []
-            raise OSError(number, os.strerror(number))
-        return [self._to_datagram(k) for k in range(n_came)]
+        datagrams: list[Datagram] = []
+        with contextlib.suppress(BlockingIOError):
+            while len(datagrams) < _MOST_AT_ONCE:
+                datagrams.append(self._receive())
+        return datagrams
 
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
 
-    def _to_datagram(self, k: int) -> Datagram:
-        message, host_ns, at = self._messages[k], 0, 0
-        port, address = _PORT_AND_ADDRESS.unpack_from(self._names[k])
-        control = ctypes.string_at(message.header.control, message.header.control_length)
-        while at + _CONTROL.size <= len(control):
-            length, level, kind = _CONTROL.unpack_from(control, at)
-            if length < _CONTROL.size:
-                break
+    def _receive(self) -> Datagram:
+        payload, ancillary, _, (address, port) = self._socket.recvmsg(
+            _MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES, socket.MSG_DONTWAIT
+        )
+        host_ns = 0
+        for level, kind, data in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
-                seconds, ns = _TIMESPEC.unpack_from(control, at + _CONTROL.size)
+                seconds, ns = _TIMESPEC.unpack_from(data)
                 host_ns = seconds * _NS_PER_S + ns
             elif (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
-                (self.n_overflowed,) = struct.unpack_from("@I", control, at + _CONTROL.size)
-            at += -(-length // _ALIGN) * _ALIGN
-        payload = ctypes.string_at(self._vectors[k].base, message.length)
-        return Datagram(host_ns or time.time_ns(), socket.inet_ntoa(address), port, self.port, payload)
+                (self.n_overflowed,) = struct.unpack_from("@I", data)
+        return Datagram(host_ns or time.time_ns(), address, port, self.port, payload)
