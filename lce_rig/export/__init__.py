@@ -1,11 +1,12 @@
 """Write results as files for other programs."""
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, re
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, choose_channels, require_known
+from lce_rig.export.writing import yaml_text
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
@@ -94,6 +96,10 @@ class ExportJob:
         camera = self.rig.cameras[calibration.camera]
         return camera.channels[calibration.channels[0]].topic or f"/{calibration.camera}"
 
+    def points_topic(self, calibration: Calibration) -> str:
+        """Name the topic of a calibration's point clouds."""
+        return self.rig.lidars[calibration.lidar].topic or f"/{calibration.lidar}/points"
+
     def head(self, content: str, *calibrations: Calibration, of_one_camera: bool = False) -> list[str]:
         """List the lines at the head of a file: content, program, whether to use it.
 
@@ -126,6 +132,12 @@ class ExportJob:
         """
         path = self.folder / name
         write_atomically(path, "\n".join(lines) + "\n")
+        return path
+
+    def write_yaml(self, name: str, head: Sequence[str], document: Mapping[str, Any]) -> Path:
+        """Write a document as YAML into the folder, after `head` as comments, as `write` does."""
+        path = self.folder / name
+        write_atomically(path, yaml_text(head, document))
         return path
 
 

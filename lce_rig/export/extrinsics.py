@@ -13,23 +13,21 @@ from lce_rig.core.errors import SessionError, reading
 from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array, invert, parse_pose, transform
 from lce_rig.export import ExportJob
-from lce_rig.export.writing import number, numbers, quaternion_wxyz, quoted, rows, texts
+from lce_rig.export.writing import quaternion_xyzw
 from lce_rig.rig import Rig
 
 
 def export_extrinsics(job: ExportJob) -> list[Path]:
     """Write extrinsics.yaml."""
-    lines = [f"# {line}" for line in job.head("extrinsics", *job.calibrations)]
-    lines += ["format_version: 1", f"rig: {quoted(job.rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
-    for calibration in job.calibrations:
-        lines += _pair(calibration, job.rig)
-    return [job.write("extrinsics.yaml", lines)]
+    pairs = [_pair(calibration, job.rig) for calibration in job.calibrations]
+    document = {"format_version": 1, "rig": job.rig.name, "made_by": MADE_BY, "pairs": pairs}
+    return [job.write_yaml("extrinsics.yaml", job.head("extrinsics", *job.calibrations), document)]
 
 
-def _pair(c: Calibration, rig: Rig) -> list[str]:
+def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
     """List the sensors, the verdict, the pose with its inverse and its covariance."""
     lidar, inverse = rig.lidars[c.lidar].frame, invert(c.T_cam_lidar)
-    points: tuple[list[str], list[str]] = [], []
+    points: tuple[dict[str, Any], dict[str, Any]] = {}, {}
     if c.is_of_lidars:
         first = rig.lidars[c.camera].frame
         axes = f"the axes of {first}"
@@ -48,62 +46,49 @@ def _pair(c: Calibration, rig: Rig) -> list[str]:
         forward = f"takes points from {in_lidar} to {in_camera}: p_cam = R p_lidar + t"
         backward = f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t"
         backward += "; the camera's pose on the LiDAR"
-    lines = [f"    {key}: {quoted(name)}" for key, name in names.items()]
-    return [
-        lines[0].replace("    ", "  - ", 1),
-        *lines[1:],
-        f"    verdict: {c.verdict}",
-        f"    reasons: {texts(finding.sentence for finding in c.findings)}",
-        *_pose_block(poses[0], forward, c.T_cam_lidar),
-        *points[0],
-        *_pose_block(poses[1], backward, inverse),
-        *points[1],
-        *_judgement(c, poses[0], axes),
-    ]
+    proven = "start_is_globally_optimal" if c.is_start_certified else "is_globally_optimal"
+    return {
+        **names,
+        "verdict": c.verdict,
+        "reasons": [finding.sentence for finding in c.findings],
+        poses[0]: _pose_block(forward, c.T_cam_lidar) | points[0],
+        poses[1]: _pose_block(backward, inverse) | points[1],
+        "covariance": {
+            "meaning": f"of {poses[0]}: translation in m, then rotation vector in rad, both along {axes}, "
+            "with R = exp(phi) R0 and t = t0 + tau, as in ROS PoseWithCovariance",
+            "matrix": c.cov,
+        },
+        "sigma_rotation_deg": c.sigma_rotation_deg,
+        "sigma_translation_m": c.sigma_translation_m,
+        proven: c.certificate.is_optimal,
+        "n_captures": c.n_captures,
+        "captures_used": c.captures_used,
+    }
 
 
-def _worked_point(c: Calibration, T_lidar_cam: Array, lens: Intrinsics) -> tuple[list[str], list[str]]:
+def _worked_point(
+    c: Calibration, T_lidar_cam: Array, lens: Intrinsics
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Give a point in front of the camera, round in the LiDAR's frame, to check the pose and its inverse."""
     point_lidar = np.round(transform(T_lidar_cam, np.array([[0.3, 0.2, 3.0]])), 2)
     point_camera = transform(c.T_cam_lidar, point_lidar)
     pixel, _ = lens.project(point_camera)
-    in_lidar = f"        p_lidar_m: {numbers(point_lidar[0])}"
-    in_camera = f"        p_cam_m: {numbers(point_camera[0])}"
-    drawn = [f"        pixel: {numbers(pixel[0])}"] if np.isfinite(pixel).all() else []
-    head = "      worked_point:"
-    return [head, in_lidar, in_camera, *drawn], [head, in_camera, in_lidar]
+    there = {"p_lidar_m": point_lidar[0], "p_cam_m": point_camera[0]}
+    back = {"p_cam_m": point_camera[0], "p_lidar_m": point_lidar[0]}
+    if np.isfinite(pixel).all():
+        there["pixel"] = pixel[0]
+    return {"worked_point": there}, {"worked_point": back}
 
 
-def _pose_block(name: str, meaning: str, T: Array) -> list[str]:
-    wxyz = quaternion_wxyz(T[:3, :3])
-    return [
-        f"    {name}:",
-        f"      meaning: {quoted(meaning)}",
-        "      matrix:",
-        *rows(T, "        "),
-        f"      translation_m: {numbers(T[:3, 3])}",
-        f"      quaternion_wxyz: {numbers(wxyz)}",
-        f"      quaternion_xyzw: {numbers(np.roll(wxyz, -1))}",
-    ]
-
-
-def _judgement(calibration: Calibration, pose: str, axes: str) -> list[str]:
-    meaning = (
-        f"of {pose}: translation in m, then rotation vector in rad, both along {axes}, "
-        "with R = exp(phi) R0 and t = t0 + tau, as in ROS PoseWithCovariance"
-    )
-    proven = "start_is_globally_optimal" if calibration.is_start_certified else "is_globally_optimal"
-    return [
-        "    covariance:",
-        f"      meaning: {quoted(meaning)}",
-        "      matrix:",
-        *rows(calibration.cov, "        "),
-        f"    sigma_rotation_deg: {number(calibration.sigma_rotation_deg)}",
-        f"    sigma_translation_m: {number(calibration.sigma_translation_m)}",
-        f"    {proven}: {'true' if calibration.certificate.is_optimal else 'false'}",
-        f"    n_captures: {calibration.n_captures}",
-        f"    captures_used: {texts(calibration.captures_used)}",
-    ]
+def _pose_block(meaning: str, T: Array) -> dict[str, Any]:
+    xyzw = quaternion_xyzw(T[:3, :3])
+    return {
+        "meaning": meaning,
+        "matrix": T,
+        "translation_m": T[:3, 3],
+        "quaternion_wxyz": np.roll(xyzw, 1),
+        "quaternion_xyzw": xyzw,
+    }
 
 
 # References are often printed with four digits.

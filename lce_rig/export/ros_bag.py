@@ -18,7 +18,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.export import NO_IMAGES, NO_SESSION, ExportJob
 from lce_rig.export.ros_files import ros_distortion
-from lce_rig.export.writing import quaternion_wxyz
+from lce_rig.export.writing import quaternion_xyzw
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
 from lce_rig.io.ros.messages import typestore
 from lce_rig.show.overlays.overlay import draw_projection, range_limits
@@ -195,7 +195,7 @@ def _write_tf_static(writer: Any, job: ExportJob, stamp_ns: int) -> None:
     transforms = []
     for joint in joints:
         x, y, z = joint.T_parent_child[:3, 3].tolist()
-        qw, qx, qy, qz = quaternion_wxyz(joint.T_parent_child[:3, :3]).tolist()
+        qx, qy, qz, qw = quaternion_xyzw(joint.T_parent_child[:3, :3]).tolist()
         pose = transform(translation=vector(x=x, y=y, z=z), rotation=quaternion(x=qx, y=qy, z=qz, w=qw))
         header = _ros_header(stamp_ns, joint.parent)
         transforms.append(stamped(header=header, child_frame_id=joint.child, transform=pose))

@@ -12,13 +12,11 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array
 from lce_rig.export import ExportJob
 from lce_rig.export.robot_tree import Joint
-from lce_rig.export.writing import number, numbers, quaternion_wxyz, quoted
+from lce_rig.export.writing import number, quaternion_xyzw, yaml_text
 from lce_rig.session.durable import write_atomically
-
-# How files of cv::FileStorage begin.
-_OPENCV = b"%YAML:1.0"
 
 
 def export_camera_info(job: ExportJob) -> list[Path]:
@@ -45,24 +43,22 @@ def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
 def camera_info_text(name: str, intrinsics: Intrinsics, head: Sequence[str]) -> str:
     """Write the content of a camera_info file, after `head` as comments."""
     model, coefficients = ros_distortion(intrinsics)
-    projection = np.hstack([intrinsics.matrix, np.zeros((3, 1))])
-    lines = [f"# {line}" for line in head]
-    lines += [
-        f"image_width: {intrinsics.width_px}",
-        f"image_height: {intrinsics.height_px}",
-        f"camera_name: {quoted(name)}",
-        *_matrix("camera_matrix", intrinsics.matrix),
-        f"distortion_model: {model}",
-        *_matrix("distortion_coefficients", np.array([coefficients])),
-        *_matrix("rectification_matrix", np.eye(3)),
-        *_matrix("projection_matrix", projection),
-    ]
-    return "\n".join(lines) + "\n"
+    document = {
+        "image_width": intrinsics.width_px,
+        "image_height": intrinsics.height_px,
+        "camera_name": name,
+        "camera_matrix": _matrix(intrinsics.matrix),
+        "distortion_model": model,
+        "distortion_coefficients": _matrix(np.array([coefficients])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.hstack([intrinsics.matrix, np.zeros((3, 1))])),
+    }
+    return yaml_text(head, document)
 
 
-def _matrix(key: str, matrix: Any) -> list[str]:
+def _matrix(matrix: Array) -> dict[str, Any]:
     n_rows, n_cols = matrix.shape
-    return [f"{key}:", f"  rows: {n_rows}", f"  cols: {n_cols}", f"  data: {numbers(matrix.ravel())}"]
+    return {"rows": n_rows, "cols": n_cols, "data": matrix.ravel()}
 
 
 def load_camera_info(path: Path) -> Intrinsics:
@@ -77,9 +73,9 @@ def load_camera_info(path: Path) -> Intrinsics:
 
     try:
         text = path.read_bytes()
-        is_opencv = text.startswith(_OPENCV)
+        is_opencv = b"!!opencv-matrix" in text
         # OpenCV's directive and tags are no YAML; what they mark reads as plain mappings.
-        data = yaml.safe_load(text.removeprefix(_OPENCV).replace(b"!!opencv-matrix", b""))
+        data = yaml.safe_load(text.removeprefix(b"%YAML:1.0").replace(b"!!opencv-matrix", b""))
         coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
         size = int(data["image_width"]), int(data["image_height"])
         K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
@@ -153,8 +149,8 @@ def _node(joint: Joint) -> list[str]:
 
 def _pose_values(joint: Joint) -> list[str]:
     """Write x, y, z in m and the quaternion x, y, z, w of a joint."""
-    xyzw = np.roll(quaternion_wxyz(joint.T_parent_child[:3, :3]), -1)
-    return [number(value) for value in (*joint.T_parent_child[:3, 3], *xyzw)]
+    T = joint.T_parent_child
+    return [number(value) for value in (*T[:3, 3], *quaternion_xyzw(T[:3, :3]))]
 
 
 def _publisher_options(joint: Joint) -> list[str]:

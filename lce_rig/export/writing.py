@@ -4,13 +4,15 @@ References:
     K. Shoemake, "Euler angle conversion", Graphics Gems IV, 1994.
 """
 
-import json
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
 from lce_rig.core.errors import ResultRefusedError
 from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.rig.loading import dump_yaml
 
 # REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own.
 R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -33,32 +35,16 @@ def number(value: float) -> str:
     return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
 
 
-def numbers(values: Iterable[float]) -> str:
-    """Write floats as a flow list: [1.0, 2.0]."""
-    return "[" + ", ".join(number(value) for value in values) + "]"
+def yaml_text(head: Iterable[str], document: Mapping[str, Any]) -> str:
+    """Write comments and a document; lists of numbers stand on one line, and read back exactly."""
+    return "".join(f"# {line}\n" for line in head) + dump_yaml(document, math.inf)
 
 
-def quoted(text: str) -> str:
-    """Write a text as a double-quoted scalar, valid in JSON and YAML."""
-    return json.dumps(text, ensure_ascii=False)
-
-
-def texts(values: Iterable[str]) -> str:
-    """Write texts as a flow list."""
-    return "[" + ", ".join(quoted(value) for value in values) + "]"
-
-
-def rows(matrix: Array, indent: str) -> list[str]:
-    """Write a matrix as YAML, one row per line."""
-    return [f"{indent}- {numbers(row)}" for row in matrix]
-
-
-def quaternion_wxyz(R: Array) -> Array:
-    """Compute the unit quaternion (4,), scalar first and not negative, of R (3, 3)."""
+def quaternion_xyzw(R: Array) -> Array:
+    """Compute the unit quaternion (4,), scalar last and not negative, of R (3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    wxyz = np.roll(Rotation.from_matrix(R).as_quat(), 1)
-    return np.asarray(wxyz if wxyz[0] >= 0 else -wxyz)
+    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True))
 
 
 def rpy(R: Array) -> Array:

@@ -116,7 +116,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     """
     if intrinsics.model == model.family and len(intrinsics.distortion) <= len(model.coefficients):
         return model.vector(intrinsics)
-    pixels, rays = _rays(intrinsics)
+    pixels, rays = grid_rays(intrinsics)
     vector = np.concatenate(
         [
             [intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px],
@@ -200,7 +200,7 @@ class LensPrior:
         displaces by 3 p r^2 focal lengths at radius r, is smaller.
         """
         vector, focal_px = convert(self.lens, model), self.lens.fx_px
-        rays = _rays(self.lens)[1]
+        rays = grid_rays(self.lens)[1]
         _, _, by_lens = model.project(vector, rays)
         D = by_lens[..., 4:].reshape(-1, model.size - 4)
         information = np.zeros((model.size, model.size))
@@ -218,7 +218,7 @@ class LensPrior:
         return vector, information
 
 
-def _rays(lens: Intrinsics) -> tuple[Array, Array]:
+def grid_rays(lens: Intrinsics) -> tuple[Array, Array]:
     """List pixels (n, 2) of a grid over the image and their rays (n, 3), where the lens has one.
 
     A pinhole polynomial cannot project points beside or behind the camera.

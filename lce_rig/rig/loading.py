@@ -8,6 +8,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, get_args
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -128,19 +129,31 @@ def _changed(whole: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def dump_yaml(data: Mapping[str, Any]) -> str:
-    """Write plain data as YAML, blocks in the order given."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+def dump_yaml(data: Mapping[str, Any], width: float = 100) -> str:
+    """Write plain data and arrays as YAML, blocks in the order given."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=width)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Write block style, but short lists of numbers on one line, and floats that read back as floats."""
+    """Write block style, but lists of numbers or names on one line, and floats that read back as floats."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write in full what occurs twice."""
+        return True
 
     def represent_sequence(
         self, tag: str, sequence: Iterable[Any], flow_style: bool | None = None
     ) -> yaml.SequenceNode:
-        is_flat = all(not isinstance(item, dict) for item in sequence)
+        is_flat = all(not isinstance(item, dict | list) for item in sequence)
         return super().represent_sequence(tag, sequence, flow_style=is_flat)
+
+    def represent_str(self, text: str) -> yaml.ScalarNode:
+        """Quote names such as 000008, which are numbers in YAML 1.2."""
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style='"' if text.isdecimal() else None)
+
+
+_Dumper.add_representer(str, _Dumper.represent_str)
+_Dumper.add_representer(np.ndarray, lambda dumper, array: dumper.represent_list((array + 0.0).tolist()))
 
 
 class _Loader(yaml.SafeLoader):

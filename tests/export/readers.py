@@ -21,7 +21,7 @@ from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export
-from lce_rig.export.other_tools import fit_coefficients
+from lce_rig.export.other_tools import fit_lens
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.profile import Mount
 from lce_rig.session import Session
@@ -325,7 +325,7 @@ READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
     ("ply", "Open3D"): _ply,
 }
 """By format and what reads it."""
-FITTED = {"kalibr": 4, "fast_livo2": 4, "koide3": 5}
+FITTED = {"kalibr": "radtan4", "fast_livo2": "radtan4", "koide3": "radtan5"}
 """Formats with fewer radtan coefficients than the profile may have."""
 MODELS = {"radtan": "k1 k2 p1 p2 k3", "fisheye": "equidistant", "rational": "k1 to k6"}
 """Kinds of lens, and their coefficients."""
@@ -390,6 +390,6 @@ def off_px(case, name, reader):
     A format with fewer coefficients holds the model that was fitted, and said to be so.
     """
     given = case.rig.cameras[case.camera].to_intrinsics()
-    intrinsics = fit_coefficients(given, FITTED[name]).intrinsics if name in FITTED else given
+    intrinsics = fit_lens(given, FITTED[name])[0] if name in FITTED else given
     wanted, is_seen = intrinsics.project(transform(case.calibration.T_cam_lidar, case.points_lidar))
     return float(np.abs(reader(case) - wanted)[is_seen].max())

@@ -14,7 +14,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export
-from lce_rig.export.other_tools import fit_coefficients
+from lce_rig.export.other_tools import fit_lens
 from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
@@ -73,6 +73,7 @@ def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(rles, mak
     np.testing.assert_allclose(
         np.linalg.inv(calibration.T_cam_lidar) @ point, [*back["p_lidar_m"], 1], atol=1e-12
     )
+    assert '"000002"' in path.read_text(encoding="utf-8")  # YAML 1.2 takes it for a number
     assert "velodyne" in pair["T_cam_lidar"]["meaning"]
     assert "davis_optical_frame" in pair["T_lidar_cam"]["meaning"]
     np.testing.assert_array_equal(pair["covariance"]["matrix"], calibration.cov)
@@ -167,10 +168,11 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(rles, make, tm
     assert load_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
 
 
+@pytest.mark.parametrize("version", ["%YAML:1.0", "%YAML 1.2"])
 @pytest.mark.parametrize("extra, model", [("", "radtan"), ("fisheye_model: 1\n", "equidistant")])
-def test_a_lens_of_opencv_is_read(extra, model, tmp_path):
+def test_a_lens_of_opencv_is_read(version, extra, model, tmp_path):
     matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [ {} ]\n"
-    text = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n" + extra
+    text = version + "\n---\nimage_width: 640\nimage_height: 480\n" + extra
     text += "camera_matrix: " + matrix.format(3, 3, "500., 0., 320., 0., 501., 240., 0., 0., 1.")
     text += "distortion_coefficients: " + matrix.format(4, 1, "0.1, 0.01, 0.001, 0.002")
     (tmp_path / "lens.yaml").write_text(text, encoding="utf-8")
@@ -212,17 +214,14 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make
 @pytest.mark.parametrize("n_coefficients", [4, 5])
 def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(three_sensor_rig, n_coefficients):
     true = three_sensor_rig.cameras["left"].to_intrinsics()
-    lens = fit_coefficients(true, n_coefficients)
-    assert len(lens.intrinsics.distortion) == n_coefficients
+    lens, rms_px, max_px = fit_lens(true, f"radtan{n_coefficients}")
+    assert len(lens.distortion) == n_coefficients
     rng = np.random.default_rng(0)
     pixels = rng.uniform(0, [true.width_px - 1, true.height_px - 1], (2000, 2))
-    drawn, is_seen = lens.intrinsics.project(true.unproject(pixels))
+    drawn, is_seen = lens.project(true.unproject(pixels))
     off_px = np.linalg.norm(drawn - pixels, axis=1)
-    assert is_seen.all() and off_px.max() < 1.05 * lens.max_px < 1.0
-    assert 0.5 * lens.rms_px < np.sqrt(np.mean(off_px**2)) < 1.2 * lens.rms_px
+    assert is_seen.all() and off_px.max() < 1.05 * max_px < 1.0
+    assert 0.5 * rms_px < np.sqrt(np.mean(off_px**2)) < 1.2 * rms_px
     # No other start finds a better one: the true camera matrix alone is worse.
     kept = replace(true, distortion=true.distortion[:n_coefficients])
-    assert (
-        np.sqrt(np.mean(np.sum((kept.project(true.unproject(pixels))[0] - pixels) ** 2, axis=1)))
-        > lens.rms_px
-    )
+    assert np.sqrt(np.mean(np.sum((kept.project(true.unproject(pixels))[0] - pixels) ** 2, axis=1))) > rms_px
