@@ -12,7 +12,7 @@ from lce_rig.core.findings import KINDS, Kind, Template
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
 HEAD = """# Findings
-`--json`, result.json and intrinsics.json hold findings as facts. Codes, figure names, units and action codes
+`--json` and result.json hold findings as facts. Codes, figure names, units and action codes
 are stable; texts may change in any release.
 
 | field | content |

@@ -53,7 +53,7 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant")
 )
 @click.option("--force", is_flag=True, help="With --save-profile: write all estimated intrinsics.")
 @explain_option
-@click.option("--json", "as_json", is_flag=True, help="Print intrinsics.json on stdout.")
+@json_option
 def intrinsics(
     session: Path,
     cameras: tuple[str, ...],
@@ -67,7 +67,7 @@ def intrinsics(
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
     Reports whether the profile's intrinsics still fit, and the weaknesses of the captures. Writes
-    SESSION/intrinsics/: camera_info and a page of plots per camera. Exits with 6 if the captures are
+    a camera_info file for each camera into SESSION/intrinsics/. Exits with 6 if the captures are
     insufficient, with 7 if --save-profile has nothing better than the profile to write.
     """
     opened = Session.open(session)
@@ -118,7 +118,7 @@ def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[st
         whole: the command that explains all.
     """
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
-    covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
+    covered = f"{100 * measured.certainty.covered:.0f}"
     colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
     yield f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"
     if advice:

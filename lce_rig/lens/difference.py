@@ -43,12 +43,11 @@ class LensCertainty:
     """Standard deviation per pixel of a lens model, after the rotation that minimises it.
 
     Attributes:
-        pixels: (H, W, 2) grid over the image.
-        sigma_px: (H, W) root of the summed variances of both coordinates; NaN for pixels without a ray.
-        is_covered: (H, W) whether boards were seen there.
+        sigma_px: (N,) at N pixels of a grid, root of the summed variances of both coordinates; NaN for pixels
+            without a ray.
+        is_covered: (N,) whether boards were seen there.
     """
 
-    pixels: Array
     sigma_px: Array
     is_covered: NDArray[np.bool_]
 
@@ -142,8 +141,7 @@ def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: L
         cov: (P, P) of its parameters.
         model: whose parameters these are.
     """
-    grid = _grid(intrinsics)
-    pixels = grid.reshape(-1, 2)
+    pixels = _grid(intrinsics).reshape(-1, 2)
     rays = intrinsics.unproject(pixels)
     is_covered, is_drawn = _inside_hull(pixels, corners_px), np.isfinite(rays).all(axis=1)
     vector = model.vector(intrinsics)
@@ -152,8 +150,7 @@ def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: L
     left = (A + J @ turn).reshape(-1, 2, model.size)
     sigma_px = np.full(len(pixels), np.nan)
     sigma_px[is_drawn] = np.sqrt(np.einsum("nai,ij,naj->n", left, cov, left))
-    shape = grid.shape[:2]
-    return LensCertainty(grid, sigma_px.reshape(shape), is_covered.reshape(shape))
+    return LensCertainty(sigma_px, is_covered)
 
 
 def _by_turn(model: LensModel, vector: Array, rays: Array) -> tuple[Array, Array, Array]:

@@ -1,9 +1,5 @@
-"""A camera's intrinsics from a session's images of the board, and their files.
+"""A camera's intrinsics from a session's images of the board, as camera_info and as a new profile."""
 
-Files are a new profile, camera_info and plots.
-"""
-
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -43,11 +39,10 @@ from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
-from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, lens_settings, parse_rig, set_value
 from lce_rig.rig.sensors import lens_block
 from lce_rig.session import Capture, Session
-from lce_rig.session.durable import replacing, write_atomically
+from lce_rig.session.durable import write_atomically
 from lce_rig.session.session import INTRINSICS
 
 Key = tuple[str, str]
@@ -276,42 +271,13 @@ def _fit(
     return estimate_intrinsics(views, board, start, lens_model, prior=prior if is_comparable else None)
 
 
-DOCUMENT = "intrinsics.json"
-FORMAT_VERSION = 1
-
-
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ in one step.
-
-    For each camera a camera_info file and a page of plots; and intrinsics.json of this run for machines.
-    Other files there stay, as those of cameras that an earlier run measured.
-
-    Returns:
-        The files of this run.
-
-    Raises:
-        LceRigError: a file cannot be written; earlier ones are unchanged.
-    """
-    from lce_rig.show.overlays.canvas import write_picture
-    from lce_rig.show.overlays.intrinsics_plot import draw_intrinsics
-
-    names = [DOCUMENT]
-
-    def finish(earlier: Path, draft: Path) -> None:
-        keep_foreign(earlier, draft, lambda path: path.name in names)
-
-    with replacing(session.path, session.path / INTRINSICS, finish) as draft:
-        content = json.dumps(document(session.rig, measured), indent=2)
-        write_atomically(draft / DOCUMENT, content + "\n")
-        for one in measured:
-            info, page = f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
-            head = _head(session.rig, one)
-            write_atomically(draft / info, camera_info_text(one.camera, one.intrinsics, head))
-            title, notes = f"Intrinsics of camera {one.camera}, rig {session.rig.name}", one.weaknesses
-            plot = draw_intrinsics(one.estimate, one.certainty, title=title, weaknesses=notes)
-            write_picture(draft / page, plot)
-            names += [info, page]
-    return [session.path / INTRINSICS / name for name in names]
+    """Write a camera_info file for each camera into intrinsics/ of the session; raises as `writing`."""
+    files = []
+    for one in measured:
+        files.append(session.path / INTRINSICS / f"camera_info_{one.camera}.yaml")
+        write_atomically(files[-1], camera_info_text(one.camera, one.intrinsics, _head(session.rig, one)))
+    return files
 
 
 def save_profile(
@@ -375,9 +341,8 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
 
 
 def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
-    """Build the content of intrinsics.json from plain types; figures that could not be computed are null."""
+    """List the figures as plain types; those that could not be computed are null."""
     return {
-        "format_version": FORMAT_VERSION,
         "rig": rig.name,
         "made_by": MADE_BY,
         "cameras": [*map(_camera, measured)],
@@ -414,7 +379,7 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
             "sigma": estimate.pattern_shape[1].tolist(),
             "print_rms_m": estimate.print_rms_m,
         },
-        "covered": float(measured.certainty.is_covered.mean()),
+        "covered": measured.certainty.covered,
         "judgement": measured.judgement.as_json(),
         "weaknesses": list(measured.weaknesses),
         "views_used": [view.name for view in estimate.views],

@@ -28,9 +28,8 @@ def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_p
     assert outcome.code == 0, outcome.err
     assert "radtan5" in outcome.out and len(outcome.out.splitlines()) <= 8
     assert "fx_px: 349.57" in lce_rig("intrinsics", few, "--explain").out
-    assert "davis.png" in outcome.err
-    document = json.loads((few / "intrinsics" / "intrinsics.json").read_text())
-    (camera,) = document["cameras"]
+    assert "camera_info_davis.yaml" in outcome.err
+    (camera,) = json.loads(lce_rig("intrinsics", few, "--json").out)["cameras"]
     assert len(camera["views_used"]) == 6 and not camera["views_refused"]
     assert camera["profile"]["verdict"] != "fail"
     measured = camera["intrinsics"]["fx_px"]

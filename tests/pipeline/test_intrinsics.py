@@ -1,6 +1,5 @@
 """Intrinsics of a session whose profile may be wrong: found, held against the profile, and written."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.camera_intrinsics import (
+    document,
     measure_intrinsics,
     save_profile,
     write_intrinsics,
@@ -123,21 +123,10 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     lens = measured.intrinsics
     info = load_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
     assert (info.matrix == lens.matrix).all()
-    document = json.loads(files[0].read_text())["cameras"][0]
-    assert document["intrinsics"]["cy_px"] == lens.cy_px
-    assert document["profile"]["verdict"] == "pass"
-    assert document["views_used"] == [f"{k:06d}.frames" for k in range(8)]
-    assert files[-1].read_bytes().startswith(b"\x89PNG")
-
-
-def test_another_run_keeps_what_is_the_users_and_other_cameras(session, measured):
-    folder = session.path / "intrinsics"
-    write_intrinsics(session, [measured])
-    (folder / "notes.txt").write_text("mine")
-    (folder / "camera_info_left.yaml").write_text("left")
-    write_intrinsics(session, [measured])
-    assert (folder / "camera_info_left.yaml").read_text() == "left"
-    assert (folder / "notes.txt").read_text() == "mine"
+    (one,) = document(session.rig, [measured])["cameras"]
+    assert one["intrinsics"]["cy_px"] == lens.cy_px
+    assert one["profile"]["verdict"] == "pass"
+    assert one["views_used"] == [f"{k:06d}.frames" for k in range(8)]
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):

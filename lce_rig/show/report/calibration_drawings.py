@@ -14,11 +14,14 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.phrasing import significant
 from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
-from lce_rig.show.overlays.intrinsics_plot import add_mean_arrows
 from lce_rig.show.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
+
+# Cells along the width of the image, and corners that one needs.
+_CELLS, _MIN_IN_CELL = 14, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,5 +184,25 @@ def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
     figure, axes = _image_axes(lens)
     every = max(1, len(evidence.corners_px) // 1500)
     axes.plot(*evidence.corners_px[::every].T, ".", color=FAINT, markersize=1)
-    add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
+    _add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
     return drawing(figure, "Residuals of the corners in the image")
+
+
+def _add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
+    """Draw the mean residual of (N, 2) in each cell of the image; a typical arrow fills its cell."""
+    cell_px = lens.width_px / _CELLS
+    cells, index, counts = np.unique(
+        np.floor((corners_px + 0.5) / cell_px), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.zeros((len(cells), 4))
+    np.add.at(sums, index.ravel(), np.hstack([corners_px, residuals_px]))
+    means = (sums / counts[:, None])[counts >= _MIN_IN_CELL]
+    if not len(means):
+        return
+    usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
+    scale = usual_px / cell_px
+    arrows = axes.quiver(
+        *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
+    )
+    label = f"{significant(usual_px)} px "
+    axes.quiverkey(arrows, 0.92, 1.11, usual_px, label, labelpos="W", labelcolor=INK)
