@@ -9,7 +9,7 @@ _CLOSER = "come closer, and move the board sideways at about 10 cm/s"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
 _WHOLE = "show the whole pattern; correct board.inner_corners (squares less one)"
-_UNCOVER = "uncover the whole pattern, or correct board.inner_corners in the profile"
+_UNCOVER = "uncover the whole pattern, come closer, or correct board.inner_corners in the profile"
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "flatten the board, or `lce-rig intrinsics {session} --save-profile FILE`"
 _CLOCKS = "check that both sensors' clocks agree"
@@ -96,13 +96,6 @@ IMAGE_CUT_OFF = Kind(
     "move the board away from the {side} border",
 )
 IMAGE_PART = Kind("image.part", _other_grid, _UNCOVER)
-IMAGE_PART_OF_SMALL = Kind(
-    "image.part_of_small",
-    "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): not all of the "
-    + _CORNERS
-    + " detected",
-    "come closer, by {closer_share:percent} of the distance or more",
-)
 IMAGE_OTHER_BOARD = Kind(
     "image.other_board",
     _other_grid,

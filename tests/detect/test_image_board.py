@@ -152,13 +152,10 @@ def test_wrong_inner_corners_are_named_with_those_seen(board, camera, T, step):
     }
 
 
-def test_a_board_of_which_a_part_is_found_because_it_is_far_is_refused_for_its_squares():
+def test_a_board_of_which_a_part_is_found_because_it_is_far_is_not_taken_for_another():
     pixels = draw(SYMMETRIC, DAVIS, looking(40, 80, 45, (0, 0, 5.2)), seed=2, blur_px=1.2)
     refusal = refused(pixels, SYMMETRIC, DAVIS)
-    assert refusal.code == "image.part_of_small" and "n_cols_seen" not in refusal.figures
-    facing_px = DAVIS.fx_px * SYMMETRIC.square_m / 5.2
-    assert facing_px * np.cos(np.radians(40)) < refusal.figure("square_px") < facing_px
-    assert refusal.figure("min_square_px") == 5.0
+    assert refusal.code == "image.part" and "n_cols_seen" not in refusal.figures
 
 
 def test_a_board_cut_off_by_the_border_is_said_to_be():

@@ -203,23 +203,6 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
     return _to_full_scale(grid, scale)
 
 
-def square_size_px(grey: Grey, n_corners: int) -> float:
-    """Measure how far apart the strongest crossings are, though no finder may link them to a grid.
-
-    Args:
-        grey: (H, W).
-        n_corners: number of crossings of the pattern.
-
-    Returns:
-        Median distance of the nearest neighbours, px; infinite if there are no two.
-    """
-    scale = _MOST_SCALE if grey.shape[1] <= _WIDE_PX else 1.0
-    points = _saddle_points(_resize(grey, scale))[0][:n_corners]
-    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(axis=1))) / scale if len(points) > 1 else np.inf
-
-
 def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
     """Find the strongest saddle points, (N, 2) px, directions (N, 2, 2) of the two edges, and strengths (N,).
 

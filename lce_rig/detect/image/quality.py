@@ -17,11 +17,10 @@ from lce_rig.detect.findings import (
     IMAGE_OTHER_BOARD,
     IMAGE_OVEREXPOSED,
     IMAGE_PART,
-    IMAGE_PART_OF_SMALL,
     IMAGE_TOO_DARK,
     IMAGE_UNCLEAR,
 )
-from lce_rig.detect.image.corners import seen_grid, square_size_px, square_values
+from lce_rig.detect.image.corners import seen_grid, square_values
 from lce_rig.detect.image.saddle import Crossings
 from lce_rig.rig import QualitySettings
 
@@ -35,8 +34,6 @@ LEAST_MARKED_PX = 20.0
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
-# Wider images are searched at this width at most.
-_SEARCHED_PX = 1280
 
 
 def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
@@ -122,9 +119,7 @@ def _alternation(values: Array, signs: Array) -> float:
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 
-def explain_absence(
-    grey: NDArray[np.uint8], board: Board, is_from_events: bool = False, min_square_px: float = 0.0
-) -> Refusal:
+def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
     """Return why the board was not found, from the grey values and from other checkerboards in the image."""
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
     if bright < 50:
@@ -134,7 +129,7 @@ def explain_absence(
         return IMAGE_OVEREXPOSED.refusal(white_share=white_share)
     seen = None if board.has_markers else seen_grid(grey)
     if seen is not None:
-        return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
+        return explain_other_grid(grey, board, seen, is_from_events)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}
     action = "events" if is_from_events else ""
     if bright - low < 50:
@@ -146,11 +141,7 @@ def explain_absence(
 
 
 def explain_other_grid(
-    grey: NDArray[np.uint8],
-    board: Board,
-    seen_px: Array,
-    is_from_events: bool = False,
-    min_square_px: float = 0.0,
+    grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
 ) -> Refusal:
     """Say that another grid of corners is in the image than the profile's, or only a part of it is found.
 
@@ -161,7 +152,6 @@ def explain_other_grid(
         board: the board wanted.
         seen_px: (rows, cols, 2).
         is_from_events: whether the image was reconstructed from events.
-        min_square_px: the profile's minimum side of a square.
     """
     rows, cols = seen_px.shape[:2]
     wanted = board.cols, board.rows
@@ -183,12 +173,6 @@ def explain_other_grid(
     if is_whole(grey, seen_px):
         figures |= {"n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     if is_part:
-        least_px = max(LEAST_SQUARE_PX * max(1.0, width / _SEARCHED_PX), min_square_px)
-        square_px = square_size_px(grey, board.cols * board.rows)
-        if square_px < least_px:
-            closer_share = 1 - square_px / least_px
-            figures |= {"square_px": square_px, "min_square_px": least_px, "closer_share": closer_share}
-            return IMAGE_PART_OF_SMALL.refusal(**figures)
         # A pattern that goes on beyond the corners found is neither covered nor another one.
         kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
         return kind.refusal(action=action, **figures)

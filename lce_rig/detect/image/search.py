@@ -97,12 +97,12 @@ def find_image_board(
     if crossings is None and not is_thorough:
         return NOT_SEEN_AT_ONCE
     if crossings is None or not (board.has_markers or np.mean(crossings.is_fitted) >= _MIN_FITTED):
-        return explain_absence(grey, board, is_from_events, limits.min_square_px)
+        return explain_absence(grey, board, is_from_events)
     quality = grid_quality(grey, crossings)
     if not board.has_markers and not is_whole(grey, crossings.grid_px):
         seen = seen_grid(grey)
         seen = crossings.grid_px if seen is None else seen
-        return explain_other_grid(grey, board, seen, is_from_events, limits.min_square_px)
+        return explain_other_grid(grey, board, seen, is_from_events)
     problem = quality_problem(quality, limits, is_from_events)
     if problem is not None:
         return problem
