@@ -64,15 +64,9 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def pair_names(
-    images: Sequence[str],
-    clouds: Sequence[str],
-    tolerance_s: float = 0.05,
-    *,
-    may_count: bool = True,
-    what: str = "images",
-    other: str = "point clouds",
+    images: Sequence[str], clouds: Sequence[str], tolerance_s: float = 0.05, *, may_count: bool = True
 ) -> tuple[Pairs, str]:
-    """Match images and point clouds by their names (without suffix).
+    """Match images, or another LiDAR's point clouds, and point clouds by their names (without suffix).
 
     Equal names are taken where nine in ten match; else the nearest time, where names are times and nine in
     ten find a partner within the tolerance; else sorted order, where there are as many images as point
@@ -82,7 +76,6 @@ def pair_names(
         images, clouds: names in natural order.
         tolerance_s: largest difference in time.
         may_count: whether sorted order will do.
-        what, other: name them in messages.
 
     Returns:
         The pairs, and how they were found, in words.
@@ -110,7 +103,7 @@ def pair_names(
     pairs, reason = max(candidates, key=lambda candidate: len(candidate[0]))
     if not pairs:
         raise SourceError(
-            f"{n} {what} and {len(clouds)} {other} cannot be paired: names and numbers differ",
+            f"{n} and {len(clouds)} files cannot be paired: names and numbers differ",
             "Give both files of a pair the same name, or remove files without a partner.",
         )
     return pairs, reason
@@ -126,17 +119,21 @@ def _nearest_pairs(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tol
     return [(int(i), int(cloud_of[i])) for i in np.flatnonzero(is_mutual & is_near)]
 
 
-def _images_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
-    """List the images in folders named after cameras: img/left/ and img/right/, or left/ and right/.
+def _by_sensor(
+    folder: Path, sensors: Collection[str], names: Sequence[str], suffixes: frozenset[str]
+) -> dict[str, list[Path]]:
+    """List the files in folders named after sensors: img/left/ and img/right/, or left/ and right/.
 
     Returns:
-        Images by camera, in the order of `cameras`; empty where no folder is named after one.
+        Files by sensor, in the order of `sensors`; empty where no folder is named after one.
     """
-    above = [path for name, path in _folders(folder).items() if name in IMAGE_FOLDERS and name not in cameras]
+    above = [path for name, path in _folders(folder).items() if name in names and name not in sensors]
     for place in (*above, folder):
         folders = _folders(place)
         found = {
-            name: files for name in cameras if name in folders and (files := _files(folders[name], SUFFIXES))
+            name: files
+            for name in sensors
+            if name.lower() in folders and (files := _files(folders[name.lower()], suffixes))
         }
         if found:
             return found
@@ -182,63 +179,36 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class ImageOnDisk:
-    """An image that has not been read yet; the timestamp comes from its name.
+class FileOnDisk:
+    """An image or a point cloud that has not been read yet; the timestamp comes from its name.
 
     Attributes:
-        label: its name, for messages; with its folder's where several cameras may have the same names.
+        label: its name, for messages; with its folder's where several sensors may have the same names.
+        sensor, channel: that it belongs to; a LiDAR has no channel.
+        settings: of the LiDAR; None of an image.
     """
 
     path: Path
     label: str
-    camera: str
+    sensor: str
     channel: str
     stamp_ns: int | None
+    settings: LidarSettings | None = None
 
-    def read(self) -> Image:
-        """Decode it.
-
-        Raises:
-            SourceError: it is missing, empty, truncated or damaged.
-        """
-        return Image(self.camera, self.channel, self.stamp_ns, read_image(self.path))
-
-
-@dataclass(frozen=True)
-class CloudOnDisk:
-    """A point cloud that has not been read yet; the timestamp comes from its name.
-
-    Attributes:
-        label: its name, for messages; with its folder's where several LiDARs may have the same names.
-    """
-
-    path: Path
-    label: str
-    lidar: str
-    settings: LidarSettings
-    stamp_ns: int | None
-
-    def read(self, notes: set[str]) -> Scan:
-        """Decode it; `notes` receives what was assumed or skipped, in words.
+    def image(self) -> Image:
+        """Decode an image.
 
         Raises:
             SourceError: it is missing, empty, truncated or damaged.
         """
-        cloud = read_cloud(self.path)
-        return to_scan(cloud, self.lidar, self.settings, str(self.path), self.stamp_ns, notes=notes)
+        return Image(self.sensor, self.channel, self.stamp_ns, read_image(self.path))
 
 
 @dataclass(frozen=True)
 class PlacementOnDisk:
-    """Images and point clouds of one placement of the board that have not been read yet."""
+    """Images, then point clouds, of one placement of the board that have not been read yet."""
 
-    images: tuple[ImageOnDisk, ...]
-    clouds: tuple[CloudOnDisk, ...]
-
-    @property
-    def files(self) -> list[ImageOnDisk | CloudOnDisk]:
-        """All of them."""
-        return [*self.images, *self.clouds]
+    files: tuple[FileOnDisk, ...]
 
     @property
     def label(self) -> str:
@@ -251,8 +221,7 @@ class PlacementOnDisk:
         Raises:
             SourceError: a file cannot be read.
         """
-        sensors = [f"{image.camera} {image.channel}" for image in self.images]
-        sensors += [cloud.lidar for cloud in self.clouds]
+        sensors = [f"{file.sensor} {file.channel}".rstrip() for file in self.files]
         digest = hashlib.sha256(" ".join(sensors).encode())
         for file in self.files:
             with reading(file.path):
@@ -266,8 +235,15 @@ class PlacementOnDisk:
             SourceError: one is missing, empty, truncated or damaged.
         """
         notes = set[str]()
-        images = tuple(image.read() for image in self.images)
-        return images, tuple(cloud.read(notes) for cloud in self.clouds), sorted(notes)
+        images = tuple(file.image() for file in self.files if file.settings is None)
+        scans = tuple(
+            to_scan(
+                read_cloud(file.path), file.sensor, file.settings, str(file.path), file.stamp_ns, notes=notes
+            )
+            for file in self.files
+            if file.settings is not None
+        )
+        return images, scans, sorted(notes)
 
 
 def _stamps_ns(files: Sequence[Path]) -> list[int | None]:
@@ -276,13 +252,13 @@ def _stamps_ns(files: Sequence[Path]) -> list[int | None]:
     return [None] * len(files) if times_ns is None else times_ns.tolist()
 
 
-def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:
+def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[FileOnDisk]]:
     """List the images of each camera.
 
     Raises:
         SourceError: there are none, or none of the camera that was asked for, or their camera is not known.
     """
-    found = _images_by_camera(folder, rig.cameras) if len(rig.cameras) > 1 else {}
+    found = _by_sensor(folder, rig.cameras, IMAGE_FOLDERS, SUFFIXES) if len(rig.cameras) > 1 else {}
     if options.camera in found:
         found = {options.camera: found[options.camera]}
     elif found and options.camera in rig.cameras:
@@ -294,21 +270,38 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
         camera, channel = choose_camera(rig, options, notes, name)
         labels = [path.name if len(by_camera) == 1 else f"{path.parent.name}/{path.name}" for path in paths]
         files = zip(paths, labels, _stamps_ns(paths), strict=True)
-        images.append([ImageOnDisk(path, label, camera, channel, ns) for path, label, ns in files])
+        images.append([FileOnDisk(path, label, camera, channel, ns) for path, label, ns in files])
     return images
 
 
-def _clouds(paths: Sequence[Path], lidar: str, rig: Rig, folder: str = "") -> list[CloudOnDisk]:
-    """List the point clouds of a LiDAR; `folder` stands before their names in messages.
+def _clouds(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[FileOnDisk]]:
+    """List the point clouds of the LiDAR, or of each LiDAR of a rig without cameras.
 
     Raises:
-        SourceError: they are LAS files, whose reader is not installed.
+        SourceError: there are none; or LAS files, whose reader is not installed.
     """
-    if any(path.suffix.lower() == ".las" for path in paths):
+    suffixes = frozenset(DECODERS)
+    if rig.cameras:
+        lidar = choose_lidar(rig, options, notes)
+        found = {lidar: _list(folder, CLOUD_FOLDERS, suffixes, "point clouds", notes)}
+    else:
+        found = _by_sensor(folder, rig.lidars, CLOUD_FOLDERS, suffixes)
+        if len(found) < 2:
+            names = [f"{name}/" for name in rig.lidars]
+            raise SourceError(
+                f"{folder}: point clouds of fewer than two LiDARs found",
+                f"Put each LiDAR's into a folder of its name: {', '.join(names)}; equal file names match.",
+            )
+    if any(path.suffix.lower() == ".las" for paths in found.values() for path in paths):
         require_las()
     return [
-        CloudOnDisk(path, folder + path.name, lidar, rig.lidars[lidar], stamp_ns)
-        for path, stamp_ns in zip(paths, _stamps_ns(paths), strict=True)
+        [
+            FileOnDisk(
+                path, path.name if rig.cameras else f"{lidar}/{path.name}", lidar, "", ns, rig.lidars[lidar]
+            )
+            for path, ns in zip(paths, _stamps_ns(paths), strict=True)
+        ]
+        for lidar, paths in found.items()
     ]
 
 
@@ -331,7 +324,7 @@ class ImagesRecording:
         """
         self.path = path
         self.notes: list[str] = []
-        self._images: list[tuple[int, ImageOnDisk]] = []
+        self._images: list[tuple[int, FileOnDisk]] = []
         self.streams: set[Stream] = set()
         ends: list[Path] = []
         for images in _images(path, rig, options, self.notes):
@@ -346,7 +339,7 @@ class ImagesRecording:
                     "(1760000000.046122.jpg) or in ns; or put the point clouds into pcd/ beside them.",
                 )
             (_, first), (_, last) = timed[0], timed[-1]
-            self.streams.add(Stream(first.camera, first.channel, "images"))
+            self.streams.add(Stream(first.sensor, first.channel, "images"))
             self._images += timed
             ends += [first.path, last.path]
         self._images.sort(key=lambda item: item[0])
@@ -363,7 +356,7 @@ class ImagesRecording:
         try:
             for _, file in self._images:
                 try:
-                    image = file.read()
+                    image = file.image()
                 except SourceError as error:
                     losses.add(NOT_DECODED(where=error.what))
                     continue
@@ -376,12 +369,12 @@ class ImagesRecording:
 
 
 class FolderRecording:
-    """Images and point clouds in folders side by side, or in one; images of several cameras in a folder each.
+    """Images and point clouds in folders side by side, or in one; those of several sensors in a folder each.
 
     Attributes:
         path: the folder.
         notes: how pairs were found and what was left over.
-        pairs: every point cloud with its images, by name of the point cloud; read them one by one.
+        pairs: every point cloud with its images, or other LiDARs' point clouds, by name of the point cloud.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -393,89 +386,56 @@ class FolderRecording:
         self.path = path
         self.notes: list[str] = []
         self._rig = rig
-        if not rig.cameras:
-            self.pairs = self._pair_scans()
-            return
-        lidar = choose_lidar(rig, options, self.notes)
-        images = _images(path, rig, options, self.notes)
-        suffixes = frozenset(DECODERS)
-        clouds = _clouds(_list(path, CLOUD_FOLDERS, suffixes, "point clouds", self.notes), lidar, rig)
+        images = _images(path, rig, options, self.notes) if rig.cameras else []
+        clouds, *lidars = _clouds(path, rig, options, self.notes)
+        others = images + lidars
         # The second image of one camera that goes with a point cloud makes a pair of its own.
-        together: dict[tuple[int, int], list[ImageOnDisk]] = {}
+        together: dict[tuple[int, int], list[FileOnDisk]] = {}
         lone: list[str] = []
-        for of_camera, pairs in zip(images, self._pair(images, clouds), strict=True):
+        for of_sensor, pairs in zip(others, self._pair(others, clouds), strict=True):
             n_held = Counter[int]()
             for i, j in pairs:
-                together.setdefault((j, n_held[j]), []).append(of_camera[i])
+                together.setdefault((j, n_held[j]), []).append(of_sensor[i])
                 n_held[j] += 1
             with_cloud = {i for i, _ in pairs}
-            lone += [image.label for i, image in enumerate(of_camera) if i not in with_cloud]
+            lone += [file.label for i, file in enumerate(of_sensor) if i not in with_cloud]
         with_image = {j for j, _ in together}
         lone += [cloud.label for j, cloud in enumerate(clouds) if j not in with_image]
         if lone:
             more = f" and {len(lone) - 6} more" if len(lone) > 6 else ""
             self.notes.append(f"{path.name}: without a partner: {', '.join(lone[:6])}{more}")
         self.pairs = [
-            PlacementOnDisk(tuple(held), (clouds[j],))
+            PlacementOnDisk(tuple(sorted([clouds[j], *held], key=lambda file: not file.channel)))
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
 
-    def _pair_scans(self) -> list[PlacementOnDisk]:
-        """Match the point clouds of a rig without cameras, in folders named after its LiDARs.
-
-        Raises:
-            SourceError: a LiDAR has no folder or no point clouds, or they cannot be matched.
-        """
-        folders = _folders(self.path)
-        place = next((folders[n] for n in CLOUD_FOLDERS if n in folders and n not in self._rig.lidars), None)
-        folders = folders if place is None else {**folders, **_folders(place)}
-        clouds = {
-            name: _clouds(files, name, self._rig, f"{name}/")
-            for name in self._rig.lidars
-            if name.lower() in folders and (files := _files(folders[name.lower()], frozenset(DECODERS)))
-        }
-        if len(clouds) < 2:
-            names = [f"{name}/" for name in self._rig.lidars]
-            raise SourceError(
-                f"{self.path}: point clouds of fewer than two LiDARs found",
-                f"Put each LiDAR's into a folder of its name: {', '.join(names)}; equal file names match.",
-            )
-        (first, firsts), *others = clouds.items()
-        together: dict[int, list[CloudOnDisk]] = {}
-        for name, seconds in others:
-            tolerance_s = max(self._rig.lidars[each].timestamps.tolerance_s for each in (first, name))
-            of_second, of_first = ([cloud.path.stem for cloud in part] for part in (seconds, firsts))
-            what, other = f"point clouds of {name}", f"of {first}"
-            pairs, reason = pair_names(of_second, of_first, tolerance_s, what=what, other=other)
-            self.notes.append(f"{self.path.name}: {first} and {name}: {len(pairs)} pairs, {reason}")
-            for i, j in pairs:
-                together.setdefault(j, [firsts[j]]).append(seconds[i])
-        return [PlacementOnDisk((), tuple(parts)) for _, parts in sorted(together.items())]
-
-    def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[CloudOnDisk]) -> list[Pairs]:
-        """Match each camera's images with the point clouds."""
-        pairings = [self._pair_camera(files, clouds) for files in images]
+    def _pair(self, others: Sequence[Sequence[FileOnDisk]], clouds: Sequence[FileOnDisk]) -> list[Pairs]:
+        """Match each camera's images, or other LiDAR's point clouds, with the point clouds."""
+        pairings = [self._pair_sensor(files, clouds) for files in others]
         if not all(reason.startswith(IN_ORDER) for _, reason in pairings):
             # A camera whose names match less well must not be counted off against the others' names.
-            pairings = [self._pair_camera(files, clouds, may_count=False) for files in images]
-        for of_camera, (pairs, reason) in zip(images, pairings, strict=True):
-            whose = f"{of_camera[0].camera}: " if len(images) > 1 else ""
+            pairings = [self._pair_sensor(files, clouds, may_count=False) for files in others]
+        for files, (pairs, reason) in zip(others, pairings, strict=True):
+            whose = f"{files[0].sensor}: " if len(others) > 1 or not files[0].channel else ""
             note = f"{self.path.name}: {whose}{len(pairs)} pairs, {reason}"
-            n_images = len(of_camera) - len(pairs)
+            n_files = len(files) - len(pairs)
             n_clouds = len(clouds) - len({j for _, j in pairs})
-            if n_images or n_clouds:
-                note += f"; {n_images} images and {n_clouds} point clouds have no partner"
+            if n_files or n_clouds:
+                what = "images" if files[0].channel else "of its"
+                note += f"; {n_files} {what} and {n_clouds} point clouds have no partner"
             self.notes.append(note)
         return [pairs for pairs, _ in pairings]
 
-    def _pair_camera(
-        self, images: Sequence[ImageOnDisk], clouds: Sequence[CloudOnDisk], *, may_count: bool = True
+    def _pair_sensor(
+        self, files: Sequence[FileOnDisk], clouds: Sequence[FileOnDisk], *, may_count: bool = True
     ) -> tuple[Pairs, str]:
-        first = images[0]
-        tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
-        stems = [image.path.stem for image in images], [cloud.path.stem for cloud in clouds]
+        first, lidar = files[0], clouds[0].sensor
+        if first.channel:
+            tolerance_s = self._rig.cameras[first.sensor].channels[first.channel].timestamps.tolerance_s
+        else:
+            tolerance_s = max(self._rig.lidars[name].timestamps.tolerance_s for name in (first.sensor, lidar))
+        stems = [file.path.stem for file in files], [cloud.path.stem for cloud in clouds]
         try:
             return pair_names(*stems, tolerance_s, may_count=may_count)
         except SourceError as error:
-            whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
-            raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None
+            raise SourceError(f"{self.path}: {first.sensor} and {lidar}: {error.what}", error.hint) from None
