@@ -22,7 +22,7 @@ from typing import BinaryIO, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
+from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
@@ -33,7 +33,6 @@ EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
 # A smaller flatbuffer has no room for its own identifier: zeros, as power cuts leave, are no packets.
 _MIN_PACKET_BYTES = 8
-_STRETCH_EVENTS = 1 << 16
 _SOURCE = re.compile("(?:DAVIS|DV)[A-Za-z0-9]*_([A-Za-z0-9]{1,64})")
 # Fields of a frame's table; 1 and 2 are of the read-out.
 _TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _FORMAT = 0, 3, 4, 5
@@ -167,15 +166,8 @@ class Aedat4Events(EventStream):
         self.resolution_px = parse_size(attributes.get("sizeX", ""), attributes.get("sizeY", ""))
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
-        """Yield the events, some packets at a time: small ones cost more to hand on than to read."""
-        waiting: list[EventColumns] = []
-        for packet in self._file.packets(self._number, losses, _decode_events):
-            waiting.append(packet)
-            if sum(map(len, waiting)) >= _STRETCH_EVENTS:
-                yield join_events(waiting)
-                waiting = []
-        if waiting:
-            yield join_events(waiting)
+        """Yield the events, a packet at a time."""
+        return self._file.packets(self._number, losses, _decode_events)
 
 
 def decode_frame(table: bytes) -> Aedat4Frame:

@@ -18,7 +18,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, EventStream
+from lce_rig.io.events.event_recording import NO_EVENTS, NS_PER_US, EventStream
 from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.messages import EventHead, decode_event_array, deserialize, header_stamp_ns
@@ -28,9 +28,6 @@ ARRAY_TYPES = frozenset({"dvs_msgs/EventArray", "prophesee_event_msgs/EventArray
 PACKET_TYPES = frozenset({"event_camera_msgs/EventPacket", "event_array_msgs/EventArray"})
 EVENT_TYPES = ARRAY_TYPES | PACKET_TYPES
 ENCODINGS = ("evt3", "libcaer_cmp", "trigger")
-_BATCH_WORDS = 1 << 16
-# A word of two bytes may hold twelve events.
-_WORDS_AT_ONCE = 1 << 17
 
 
 class EventPacket(NamedTuple):
@@ -85,46 +82,24 @@ class PacketDecoder:
     def __init__(self) -> None:
         self._evt3 = WordDecoder(EVT3)
         self._compressed = WordDecoder(LIBCAER_CMP)
-        self._waiting: list[EventPacket] = []
-        self._n_waiting = 0
 
-    def decode(self, packet: EventPacket) -> Iterator[EventColumns]:
-        """Yield the events that are decoded by now: small EVT3 packets are decoded together, later.
+    def decode(self, packet: EventPacket) -> EventColumns:
+        """Decode a packet.
 
         Raises:
-            ValueError: the packet is damaged or of no known encoding.
+            ValueError: it is of no known encoding.
         """
+        events, base_ns = NO_EVENTS, 0
         if packet.encoding == "evt3":
-            self._waiting.append(packet)
-            self._n_waiting += len(packet.words)
-            if self._n_waiting >= _BATCH_WORDS:
-                yield from self.finish()
-            return
-        yield from self.finish()
-        if packet.encoding == "libcaer_cmp":
+            events = self._evt3.decode(packet.words)
+        elif packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
-            for words in _pieces(packet.words):
-                events = self._compressed.decode(words)
-                # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
-                base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
-                yield replace(events, t_ns=events.t_ns + base_ns, host_ns=packet.head.stamp_ns)
+            events = self._compressed.decode(packet.words)
+            # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
+            base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
         elif packet.encoding != "trigger":
             raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
-
-    def finish(self) -> Iterator[EventColumns]:
-        """Yield the events of the packets that wait."""
-        if self._waiting:
-            words = [packet.words for packet in self._waiting]
-            host_ns: int | None = self._waiting[0].head.stamp_ns
-            self._waiting, self._n_waiting = [], 0
-            for piece in _pieces(np.concatenate(words)):
-                events = self._evt3.decode(piece)
-                yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
-                host_ns = None
-
-
-def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
-    return (words[at : at + _WORDS_AT_ONCE] for at in range(0, len(words), _WORDS_AT_ONCE))
+        return replace(events, t_ns=events.t_ns + base_ns, host_ns=packet.head.stamp_ns)
 
 
 class BagEvents(EventStream):
@@ -162,7 +137,7 @@ class BagEvents(EventStream):
                 break
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
-        """Yield the events, one or several messages at a time."""
+        """Yield the events, a message at a time."""
         decoder = PacketDecoder()
         last_number: int | None = None
         for index, message in self._messages(self._topic, losses):
@@ -174,7 +149,7 @@ class BagEvents(EventStream):
                     continue
                 packet = parse_packet(message)
                 self._check_size(packet.head)
-                yield from decoder.decode(packet)
+                yield decoder.decode(packet)
             except ValueError as error:
                 losses.add(findings.BROKEN_PACKETS(where=f"message {index}: {error}"))
                 continue
@@ -182,7 +157,6 @@ class BagEvents(EventStream):
                 lost = findings.PACKETS_LOST(where=f"before message {index}")
                 losses.add(lost, packet.number - last_number - 1)
             last_number = packet.number
-        yield from decoder.finish()
 
     def _check_size(self, head: EventHead) -> None:
         if self.resolution_px and (head.width_px, head.height_px) != self.resolution_px:
