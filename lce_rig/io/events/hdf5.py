@@ -33,12 +33,11 @@ class Hdf5Events(EventStream):
         """
         self._path = path
         self.notes: list[str] = []
+        self.resolution_px = None
         with _open(path) as file:
             # Columns of a torn file differ in length.
             self._n_events = min(len(_column(file, name)) for name in _COLUMNS)
-            width, height = _number(file, "width"), _number(file, "height")
-            self.resolution_px = (width, height) if width and height else None
-            self._offset_us = _number(file, "t_offset") or 0
+            self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
@@ -90,14 +89,3 @@ def _column(file: Any, name: str) -> Any:
     if getattr(column, "ndim", 0) != 1 or column.dtype.kind not in "biuf":
         raise ValueError(f"it has no list of numbers {name}")
     return column
-
-
-def _number(file: Any, name: str) -> int | None:
-    """Read a number of the file or of its events, an attribute or a dataset of one; None if it is absent."""
-    for holder in (file, file["events"]):
-        value = holder.attrs.get(name)
-        if value is None and name in holder:
-            value = holder[name][()]
-        if value is not None:
-            return int(np.asarray(value).item())
-    return None
