@@ -2,16 +2,14 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError, reason_of
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError
 from lce_rig.fleet.storage import Storage
-from lce_rig.rig.loading import find_profile
+from lce_rig.rig.loading import explain, find_profile, read_document
 from lce_rig.session.identity import MARKER
 
 MANIFEST = "fleet.yaml"
@@ -70,6 +68,10 @@ class Entry(BaseModel):
         return self.robot or (match[1] if match is not None and match.groups() else "")
 
 
+class _Manifest(BaseModel):
+    sessions: list[Entry]
+
+
 def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """List the sessions and recordings below a folder.
 
@@ -108,24 +110,14 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 def _entries(manifest: Storage, content: bytes) -> list[Entry]:
     """Read a manifest."""
     try:
-        documents: Any = yaml.safe_load(content.decode()) or {}
-        if isinstance(documents, Mapping):
-            documents = documents.get("sessions")
-        if not isinstance(documents, list):
-            raise TypeError("no list `sessions`")
-        return [Entry.model_validate(document) for document in documents]
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key, problem = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        raise UsageError(
-            f"{manifest.url}: {key}: {problem}; {first['input']!r:.60} given",
-            f"Keys: {', '.join(Entry.model_fields)}; see docs/fleets.md.",
-        ) from None
-    except Exception as error:  # yaml raises many kinds about odd text
-        raise UsageError(
-            f"{manifest.url} is not a manifest: {reason_of(error)}",
-            "List entries with `path` below `sessions:`.",
-        ) from error
+        document = read_document(content.decode(errors="replace"), manifest.url)
+        try:
+            return _Manifest.model_validate(document.data).sessions
+        except ValidationError as error:
+            raise explain(error, document) from None
+    except ProfileError as error:
+        hint = f"Keys below `sessions:`: {', '.join(Entry.model_fields)}; see docs/fleets.md."
+        raise UsageError(error.what, error.hint or hint) from None
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:

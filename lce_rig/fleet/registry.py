@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lce_rig.core.calibration import Calibration, read_result
-from lce_rig.core.errors import LceRigError, SessionError, UsageError, reason_of
+from lce_rig.core.errors import LceRigError, SessionError, UsageError, reading, reason_of
 from lce_rig.core.files import parse_json
 from lce_rig.core.geometry import Array
 from lce_rig.fleet.findings import DAMAGED
@@ -75,6 +75,7 @@ _TYPES = {**SESSION, **{name: kind for name, (kind, _) in PAIR.items()}}
 SCHEMA = pa.schema([pa.field(name, kind) for name, kind in _TYPES.items()])
 COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
 
+_WRITE_AGAIN = "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
 # Rows that share minima and maxima, by which a query skips them.
 _ROWS_PER_GROUP = 1 << 16
 # Poses and covariances, most of the bytes, do not shrink: the fastest to read wins.
@@ -148,33 +149,33 @@ def table_bytes(table: Any) -> bytes:
     return buffer.getvalue()
 
 
-def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) -> Any:
+def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None) -> Any:
     """Read a table as a `pyarrow.Table`.
 
     Args:
-        source: its file, or the file's content.
+        place: path or address of its file.
         columns: the names of those to read; None for all.
 
     Raises:
         SessionError: there is no such file, or it is not such a table.
     """
+    place = place if isinstance(place, Storage) else Storage.at(place)
     names = list(SCHEMA.names if columns is None else columns)
     try:
-        table = pq.read_table(source, columns=names)
+        with (
+            place.reached() as (fs, path),
+            fs.open(path) as file,
+            reading(
+                place.url, SessionError, "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
+            ),
+        ):
+            table = pq.read_table(file, columns=names)
+            if table.column_names != names:
+                raise ValueError("it lacks columns of this version")
     except FileNotFoundError:
         raise SessionError(
-            f"{source}: there is no such table", "`lce-rig fleet run ROOT --registry FOLDER` writes it."
+            f"{place.url}: there is no such table", "`lce-rig fleet run ROOT --registry FOLDER` writes it."
         ) from None
-    except (OSError, pa.ArrowException) as error:
-        raise SessionError(
-            f"{source} cannot be read as a table: {error}",
-            "`lce-rig fleet table --registry FOLDER --rebuild` writes it again.",
-        ) from error
-    if table.column_names != names:
-        raise SessionError(
-            f"{source} lacks columns of this version",
-            "Write it again: `lce-rig fleet table --registry FOLDER --rebuild`.",
-        )
     return table.cast(pa.schema([SCHEMA.field(name) for name in names]))
 
 
@@ -323,20 +324,9 @@ class Registry:
         unknown = sorted(set(names) - set(SCHEMA.names))
         if unknown:
             raise UsageError(f"the table has no column {unknown[0]!r}", COLUMNS)
-        source: Path | io.BytesIO
-        if self.place.local is not None:
-            source = self.place.local / TABLE
-        else:
-            content = (self.place / TABLE).read()
-            if content is None:
-                raise SessionError(
-                    f"{self.place.url} has no {TABLE}",
-                    "`lce-rig fleet run ROOT --registry FOLDER` writes it.",
-                )
-            source = io.BytesIO(content)
         if not where.strip():
-            return read_table(source, names)
-        return chosen_rows(read_table(source), where).select(names)
+            return read_table(self.place / TABLE, names)
+        return chosen_rows(read_table(self.place / TABLE), where).select(names)
 
     def write_table(self, table: Any) -> None:
         """Write the table in one step; raises SessionError."""
