@@ -109,9 +109,7 @@ class StagedBoard:
     def view(self, camera: str) -> MovingView:
         """Look at the board through a camera's lens."""
         stage = self.stage
-        return MovingView(
-            stage.backdrops[camera], stage.board, self.trajectory, self.scene_at, stage.options.camera
-        )
+        return MovingView(stage.backdrops[camera], stage.board, self.trajectory, stage.options.camera)
 
     def take_events(
         self, camera: str, start_ns: int, end_ns: int, every_ns: int, stream: Stream
