@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -35,43 +35,27 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
 
-class _FileEntry(_Record):
+class Entry(_Record):
+    """The file of an image, a scan or a range of events; what other kinds have is empty."""
+
+    kind: Literal["image", "scan", "events"]
+    camera: Name = ""
+    channel: Name = ""
+    lidar: Name = ""
     # No manifest names a file outside its folder.
     file: Annotated[str, Field(pattern=f"^{SAFE_NAME.pattern}$")]
     bytes: int
     sha256: str
     host_ns: _Stamp
+    stamp_ns: _Stamp = None
+    first_ns: _Stamp = None
+    last_ns: _Stamp = None
 
-
-class ImageEntry(_FileEntry):
-    """An image's file."""
-
-    kind: Literal["image"]
-    camera: Name
-    channel: Name
-    stamp_ns: _Stamp
-
-
-class ScanEntry(_FileEntry):
-    """A scan's file."""
-
-    kind: Literal["scan"]
-    lidar: Name
-    stamp_ns: _Stamp
-
-
-class EventsEntry(_FileEntry):
-    """The file of a range of events."""
-
-    kind: Literal["events"]
-    camera: Name
-    channel: Name
-    first_ns: _Stamp
-    last_ns: _Stamp
-
-
-Entry = ImageEntry | ScanEntry | EventsEntry
-_SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
+    @property
+    def source(self) -> str:
+        """What it holds, such as "image of cam.frames"."""
+        sensor = f"{self.camera}.{self.channel}" if self.kind == "image" else self.camera or self.lidar
+        return f"{self.kind} of {sensor}"
 
 
 class Manifest(_Record):
@@ -79,32 +63,15 @@ class Manifest(_Record):
 
     format_version: Annotated[int, Field(ge=1)]
     content_sha256: str
-    files: list[Annotated[Entry, Field(discriminator="kind")]]
+    files: list[Entry]
     meta: dict[str, Any]
-
-    @property
-    def images(self) -> list[ImageEntry]:
-        """Entries of images."""
-        return [entry for entry in self.files if isinstance(entry, ImageEntry)]
-
-    @property
-    def scans(self) -> list[ScanEntry]:
-        """Entries of scans."""
-        return [entry for entry in self.files if isinstance(entry, ScanEntry)]
-
-    @property
-    def events(self) -> list[EventsEntry]:
-        """Entries of stretches of events."""
-        return [entry for entry in self.files if isinstance(entry, EventsEntry)]
 
     @model_validator(mode="after")
     def _sensors_are_named_once(self) -> "Manifest":
-        names = [f"image of {entry.camera}.{entry.channel}" for entry in self.images]
-        names += [f"scan of {entry.lidar}" for entry in self.scans]
-        names += [f"events of {entry.camera}" for entry in self.events]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"{name} is named twice")
+        sources = [entry.source for entry in self.files]
+        for source in sources:
+            if sources.count(source) > 1:
+                raise ValueError(f"{source} is named twice")
         return self
 
 
@@ -141,17 +108,15 @@ class Capture:
     @property
     def contents(self) -> list[dict[str, Any]]:
         """What samples it holds: sensor, timestamps and SHA-256 of each file, in a fixed order."""
-        return sorted(
-            (entry.model_dump(exclude={"file", "bytes"}) for entry in self._manifest.files),
-            key=lambda entry: str(entry["sha256"]),
-        )
+        files = sorted(self._manifest.files, key=lambda entry: entry.sha256)
+        return [entry.model_dump(exclude={"file", "bytes"}, exclude_unset=True) for entry in files]
 
     @property
     def times_ns(self) -> list[int]:
         """When its samples arrived, on this computer's clock; their own timestamps where that is unknown."""
         files = self._manifest.files
         arrivals = [entry.host_ns for entry in files if entry.host_ns is not None]
-        stamps = [e.last_ns if isinstance(e, EventsEntry) else e.stamp_ns for e in files]
+        stamps = [entry.last_ns if entry.kind == "events" else entry.stamp_ns for entry in files]
         return arrivals or [stamp for stamp in stamps if stamp is not None]
 
     @property
@@ -172,19 +137,24 @@ class Capture:
             return hashlib.sha256((self.path / MANIFEST).read_bytes()).hexdigest()
 
     @property
+    def sources(self) -> list[str]:
+        """What it holds, such as "image of cam.frames"."""
+        return [entry.source for entry in self._manifest.files]
+
+    @property
     def image_keys(self) -> list[tuple[str, str]]:
         """(camera, channel) of every image, sorted."""
-        return sorted((entry.camera, entry.channel) for entry in self._manifest.images)
+        return sorted((e.camera, e.channel) for e in self._manifest.files if e.kind == "image")
 
     @property
     def lidars(self) -> list[str]:
         """Names of the LiDARs with a scan, sorted."""
-        return sorted(entry.lidar for entry in self._manifest.scans)
+        return sorted(entry.lidar for entry in self._manifest.files if entry.kind == "scan")
 
     @property
     def event_cameras(self) -> list[str]:
         """Names of the cameras with events, sorted."""
-        return sorted(entry.camera for entry in self._manifest.events)
+        return sorted(entry.camera for entry in self._manifest.files if entry.kind == "events")
 
     def has_image(self, camera: str, channel: str) -> bool:
         """Return whether this capture has an image of that camera and channel."""
@@ -198,8 +168,7 @@ class Capture:
         """
         import cv2
 
-        entries = [e for e in self._manifest.images if (e.camera, e.channel) == (camera, channel)]
-        entry, data = self._only(entries, f"nothing from {camera}.{channel}")
+        entry, data = self._load(f"image of {camera}.{channel}")
         with self._reading(entry.file):
             pixels = decode_pixels(data, cv2.IMREAD_UNCHANGED)
             return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
@@ -210,8 +179,7 @@ class Capture:
         Raises:
             SessionError: there is none, or it is damaged.
         """
-        entries = [e for e in self._manifest.scans if e.lidar == lidar]
-        entry, data = self._only(entries, f"nothing from {lidar}")
+        entry, data = self._load(f"scan of {lidar}")
         with self._reading(entry.file):
             cloud = decode_pcd(data)
             return Scan(
@@ -230,8 +198,7 @@ class Capture:
         Raises:
             SessionError: there are none, or they are damaged.
         """
-        entries = [e for e in self._manifest.events if e.camera == camera]
-        entry, data = self._only(entries, f"no events from {camera}")
+        entry, data = self._load(f"events of {camera}")
         with self._reading(entry.file):
             return decode_events(data, camera)
 
@@ -257,13 +224,13 @@ class Capture:
                 first = error.errors(include_url=False)[0]
                 raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
-    def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> tuple[_SOME_ENTRY, bytes]:
-        """Return the entry of a sensor, at most one, with its file's content."""
-        if entries:
-            return entries[0], self._read(entries[0])
-        have = [".".join(key) for key in self.image_keys] + self.lidars
-        have += [f"events of {camera}" for camera in self.event_cameras]
-        raise SessionError(f"capture {self.name} has {lacking}; it has {', '.join(have) or 'nothing'}")
+    def _load(self, source: str) -> tuple[Entry, bytes]:
+        """Return the entry of a source with its file's content."""
+        for entry in self._manifest.files:
+            if entry.source == source:
+                return entry, self._read(entry)
+        have = ", ".join(self.sources) or "nothing"
+        raise SessionError(f"capture {self.name} has no {source}; it has {have}")
 
     def _read(self, entry: Entry) -> bytes:
         with self._reading(entry.file):
@@ -286,15 +253,15 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
         SessionError: there are none, two of one sensor, one of a sensor that the rig lacks, or events of
             another resolution than the camera's.
     """
-    keys = [(i.sensor, i.channel) for i in images]
-    keys += [(s.sensor, "") for s in scans] + [(e.sensor, "raw events") for e in events]
-    if len(set(keys)) < len(keys) or not keys:
+    sources = [f"image of {i.sensor}.{i.channel}" for i in images]
+    sources += [f"scan of {s.sensor}" for s in scans] + [f"events of {e.sensor}" for e in events]
+    if len(set(sources)) < len(sources) or not sources:
         raise SessionError(
             "a capture holds at most one image per camera channel, one scan per lidar and one stretch of "
             "events a camera at most, and not nothing"
         )
-    cameras = [e.sensor for e in events]
-    _require_sensors(rig, [(i.sensor, i.channel) for i in images], [s.sensor for s in scans], cameras)
+    if foreign := _foreign(sources, rig):
+        raise SessionError(f"rig {rig.name!r} has no {foreign}", "Add it to the profile, or leave it out.")
     for stretch in events:
         size, wanted = (stretch.width_px, stretch.height_px), rig.cameras[stretch.sensor].resolution_px
         if size != wanted:
@@ -311,42 +278,20 @@ def check_capture(rig: Rig, capture: Capture) -> None:
     Raises:
         SessionError: it names another sensor, or its manifest is damaged.
     """
-    images, lidars, event_cameras = capture.image_keys, capture.lidars, capture.event_cameras
-    try:
-        _require_sensors(rig, images, lidars, event_cameras)
-    except SessionError as error:
+    if foreign := _foreign(capture.sources, rig):
         raise SessionError(
-            f"capture {capture.name} belongs to another rig: {error.what}",
+            f"capture {capture.name} belongs to another rig: rig {rig.name!r} has no {foreign}",
             f"Remove {capture.path} and collect again; the other captures are not affected.",
-        ) from None
+        )
 
 
-def _require_sensors(
-    rig: Rig, images: Sequence[tuple[str, str]], lidars: Sequence[str], event_cameras: Sequence[str]
-) -> None:
-    for name, channel in images:
-        if name not in rig.cameras or channel not in rig.cameras[name].channels:
-            raise SessionError(f"rig {rig.name!r} has no camera channel {name}.{channel}")
-    for name in lidars:
-        if name not in rig.lidars:
-            raise SessionError(f"rig {rig.name!r} has no lidar {name!r}")
-    for name in event_cameras:
-        event_channel(rig, name)
-
-
-def event_channel(rig: Rig, camera: str) -> str:
-    """Name the channel that a camera's events belong to, its first of kind events.
-
-    Raises:
-        SessionError: the rig has no such camera, or the camera no such channel.
-    """
-    channel = rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
-    if channel is not None:
-        return channel
-    raise SessionError(
-        f"rig {rig.name!r} has no camera {camera!r} with events",
-        f"Add a channel with `kind: events` to the profile, under cameras.{camera}.channels.",
-    )
+def _foreign(sources: Sequence[str], rig: Rig) -> str | None:
+    """Name the first source that a rig lacks; None if it has all."""
+    known = {f"scan of {name}" for name in rig.lidars}
+    for name, camera in rig.cameras.items():
+        known |= {f"image of {name}.{channel}" for channel in camera.channels}
+        known |= {f"events of {name}"} if camera.first_channel("events") else set()
+    return next((source for source in sources if source not in known), None)
 
 
 def content_hash(images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()) -> str:

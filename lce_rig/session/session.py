@@ -20,7 +20,7 @@ from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
-from lce_rig.session.capture import Capture, check_samples, content_hash, event_channel, write_capture
+from lce_rig.session.capture import Capture, check_samples, content_hash, write_capture
 from lce_rig.session.durable import (
     WriterLock,
     append_line,
@@ -329,7 +329,7 @@ class Session:
         images, scans, events = list(images), list(scans), list(events)
         self._require_lock()
         check_samples(self.rig, images, scans, events)
-        recorded = [(event_channel(self.rig, stretch.sensor), stretch) for stretch in events]
+        recorded = [(self.rig.cameras[e.sensor].first_channel("events") or "", e) for e in events]
         contents = self._contents()
         name = self.next_name
         folder = self.path / CAPTURES / name
