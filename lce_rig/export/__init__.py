@@ -14,7 +14,7 @@ from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, choose_channels, require_known
+from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, require_known
 from lce_rig.export.writing import yaml_text
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -56,7 +56,7 @@ class ExportJob:
     """The source of an output.
 
     Attributes:
-        calibrations: one for each camera channel and LiDAR.
+        calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
         folder: for the files.
         robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
@@ -71,15 +71,10 @@ class ExportJob:
     session: Session | None = None
     findings: list[Finding] = field(default_factory=list)
 
-    @cached_property
-    def chosen(self) -> list[Calibration]:
-        """One calibration of each camera and LiDAR."""
-        return choose_channels(self.calibrations, self.rig)
-
     @property
     def of_cameras(self) -> list[Calibration]:
-        """Those of them that are not of two LiDARs."""
-        return [c for c in self.chosen if not c.is_of_lidars]
+        """The calibrations that are not of two LiDARs."""
+        return [c for c in self.calibrations if not c.is_of_lidars]
 
     @cached_property
     def trees(self) -> list[FrameTree]:
@@ -229,7 +224,7 @@ def export(
     for this result.
 
     Args:
-        calibrations: one for each camera channel and LiDAR.
+        calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.

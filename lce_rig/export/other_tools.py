@@ -306,7 +306,7 @@ def _write_poses(
     entries: Sequence[_Entry],
 ) -> Path:
     """Write poses by frame, below the frame that they are in."""
-    head = job.head(content, *job.chosen)
+    head = job.head(content, *job.calibrations)
     for entry in entries:
         place = "the frame of the profile"
         if entry.key != entry.frame:

@@ -18,8 +18,6 @@ from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
 from lce_rig.export.writing import T_BODY_OPTICAL
 from lce_rig.rig import Rig
 
-_VERDICTS = ("pass", "marginal", "fail")
-
 
 class Joint(NamedTuple):
     """A joint between two frames.
@@ -189,24 +187,6 @@ class RobotTree:
         return replace(self, frames=frames, above={**self.above, joint.child: new})
 
 
-def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
-    """Keep one calibration of each camera and LiDAR: by verdict, then by the smaller sigma.
-
-    Raises:
-        LceRigError: a calibration names a sensor or channel that the rig does not have.
-    """
-    best: dict[tuple[str, str], Calibration] = {}
-    ranks: dict[tuple[str, str], tuple[int, float, float]] = {}
-    for calibration in calibrations:
-        require_known(calibration, rig)
-        pair = calibration.camera, calibration.lidar
-        sigmas = calibration.sigma_rotation_deg, calibration.sigma_translation_m
-        rank = _VERDICTS.index(calibration.verdict), *sigmas
-        if pair not in best or rank < ranks[pair]:
-            best[pair], ranks[pair] = calibration, rank
-    return list(best.values())
-
-
 def require_known(calibration: Calibration, rig: Rig) -> None:
     """Check that a calibration names sensors of the rig.
 
@@ -235,7 +215,7 @@ def fit_tree(
 
     Args:
         robot: its own tree; None for one of the sensors alone, under `mount` where the profile has one.
-        calibrations: of the rig's sensors; one each of a camera and LiDAR is used.
+        calibrations: of the rig's sensors.
         rig: the profile, which names the frames.
 
     Returns:
@@ -246,12 +226,13 @@ def fit_tree(
         SessionError: the robot has none of a calibration's frames, or a joint between two of them moves, or
             a frame would get two parents.
     """
-    chosen = choose_channels(calibrations, rig)
+    for calibration in calibrations:
+        require_known(calibration, rig)
     tree, changes = _mounted(robot, rig)
     bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
     bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
     groups: list[tuple[str, ...]] = []
-    for names in _connected(chosen, bodies):
+    for names in _connected(calibrations, bodies):
         frames = [bodies[name] for name in names]
         if robot is None and not tree.frames.intersection(frames):
             root = rig.root_frame if rig.root_frame in frames else frames[0]
@@ -264,7 +245,7 @@ def fit_tree(
             )
         placed = [min(present, key=lambda frame: len(tree.chain(frame)))]
         for anchor in placed:  # which grows
-            for calibration in chosen:
+            for calibration in calibrations:
                 lidar = rig.lidars[calibration.lidar].frame
                 camera = bodies[calibration.camera]
                 if anchor in (lidar, camera) and not {lidar, camera} <= set(placed):
@@ -328,10 +309,10 @@ def _mounted(robot: RobotTree | None, rig: Rig) -> tuple[RobotTree, list[JointCh
     return tree.with_joint(joint), [JointChange(joint, None)]
 
 
-def _connected(chosen: Sequence[Calibration], bodies: Mapping[str, str]) -> list[list[str]]:
+def _connected(calibrations: Sequence[Calibration], bodies: Mapping[str, str]) -> list[list[str]]:
     """Group the sensors that calibrations connect, in the order of the rig."""
     groups: list[set[str]] = []
-    for calibration in chosen:
+    for calibration in calibrations:
         joined = {calibration.camera, calibration.lidar}
         touching = [group for group in groups if group & joined]
         groups = [group for group in groups if not group & joined] + [joined.union(*touching)]

@@ -162,7 +162,7 @@ def _bag_writer(folder: Path, content: str, job: ExportJob) -> Iterator[Any]:
         # Version 8 states QoS in the numbers that Humble reads as well; 9 does in words, since Jazzy.
         writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        for index, line in enumerate(job.head(content, *job.chosen)):
+        for index, line in enumerate(job.head(content, *job.calibrations)):
             writer.set_custom_data(f"about_{index}", line)
         with writer:
             yield writer

@@ -99,7 +99,7 @@ _OPTIONS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 def export_static_tf(job: ExportJob) -> list[Path]:
     """Write static_transforms.txt."""
     joints = [joint for tree in job.trees for joint in tree.joints if not joint.is_given]
-    lines = [f"# {line}" for line in job.head("static transforms", *job.chosen)]
+    lines = [f"# {line}" for line in job.head("static transforms", *job.calibrations)]
     lines += [
         "# each line gives the pose of the child in its parent; publish either these or the URDF, not both"
     ]
@@ -115,7 +115,7 @@ def export_static_tf(job: ExportJob) -> list[Path]:
 
 def export_ros2_launch(job: ExportJob) -> list[Path]:
     """Write RIG.launch.py, one static_transform_publisher a joint."""
-    lines = [f"# {line}" for line in job.head("ROS 2 launch file", *job.chosen)]
+    lines = [f"# {line}" for line in job.head("ROS 2 launch file", *job.calibrations)]
     lines += [
         "from launch import LaunchDescription",
         "from launch_ros.actions import Node",

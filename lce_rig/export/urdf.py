@@ -60,7 +60,7 @@ def _urdf(tree: FrameTree, job: ExportJob) -> list[str]:
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
     # A double hyphen would end an XML comment early. ROS 2 reads a parameter's value as YAML, in which ": "
     # makes a mapping: `robot_description:="$(cat rig.urdf)"` would be refused.
-    head = job.head("URDF", *job.chosen)
+    head = job.head("URDF", *job.calibrations)
     lines += [f"<!-- {line.replace('--', '- -').replace(': ', ' - ')} -->" for line in head]
     lines.append(f"<robot name={quoteattr(job.rig.name)}>")
     lines += [f"  <link name={quoteattr(frame)}/>" for frame in tree.frames]

@@ -15,7 +15,7 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export
 from lce_rig.export.other_tools import fit_lens
-from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
+from lce_rig.export.robot_tree import Joint, RobotTree
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
 from lce_rig.export.writing import T_BODY_OPTICAL
@@ -117,16 +117,6 @@ def test_sensors_that_no_calibration_connects_get_a_urdf_each(three_sensor_rig, 
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
     paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
-
-
-def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles, make):
-    events = make(random_pose(1), channels=("events",))
-    surer = replace(make(), cov=events.cov / 4)
-    for frames, wanted in ((surer, "frames"), (replace(surer, verdict="marginal"), "events")):
-        (tree,) = build_trees([events, frames], rles)
-        chosen = frames if wanted == "frames" else events
-        T_lidar_body = invert(chosen.T_cam_lidar) @ invert(T_BODY_OPTICAL)
-        np.testing.assert_allclose(tree.joints[0].T_parent_child, T_lidar_body)
 
 
 @pytest.mark.parametrize(
