@@ -9,7 +9,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.collect_live import run_live, show_next
-from lce_rig.cli.options import FiniteRange, path_option, require_sensors, robot_option
+from lce_rig.cli.options import FiniteRange, path_option, require_sensors, robot_option, session_argument
 from lce_rig.cli.simulate import require_kind
 from lce_rig.collect.findings import IMAGE_NONE
 from lce_rig.collect.gates import stillness_window_s
@@ -43,8 +43,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Set the rig profile: a shipped name or a file [default: that of an existing SESSION].",
 )
 @robot_option
-@click.argument("session", type=click.Path(path_type=Path), required=False)
-@path_option("-o", "--output", "SESSION", "Name the session, as SESSION.")
+@session_argument
 @path_option(
     "--from",
     "paths",
@@ -105,7 +104,6 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Live: capture after the board has stood still for S seconds  [default: 1.5]",
 )
 @click.option("--plain", is_flag=True, help="Live: print lines on stderr instead of the full-screen view.")
-@click.option("--silent", is_flag=True, help="Live: ring no bell at captures and refused ones.")
 @click.option(
     "--preview",
     is_flag=False,
@@ -119,8 +117,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 def collect(
     rig_name: str | None,
     robot: str | None,
-    session: Path | None,
-    output: Path | None,
+    session: Path,
     paths: tuple[Path, ...],
     topics: dict[str, str],
     cameras: tuple[str, ...],
@@ -142,9 +139,6 @@ def collect(
 
     Run the same command again to continue; existing captures are not repeated.
     """
-    if session is not None and output is not None:
-        raise UsageError(f"SESSION is named twice: {session} and {output}", "Omit one of them.")
-    session = session or output or Path("session")
     if rig_name is not None:
         rig = load_rig(rig_name)
     elif (session / MARKER).exists():

@@ -46,7 +46,6 @@ def run_live(
     keep_going: bool,
     hold: float | None,
     plain: bool,
-    silent: bool,
     preview: str | None,
     record: Path | None,
     simulated: bool,
@@ -75,7 +74,6 @@ def run_live(
             is_plain=plain,
             has_keys=asked.is_interactive,
             links=() if page is None else page.urls,
-            is_silent=silent,
             wants_code=lambda: asked.wants_code,
         ) as view:
             listeners = [_until_gone(view.show)]

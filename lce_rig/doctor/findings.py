@@ -29,17 +29,17 @@ DISK = note_kind("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s 
 DISK_FULL = Kind(
     "computer.disk_full",
     "too little space (minimum 5000 MB)",
-    "make room, or `lce-rig collect --rig RIG -o FOLDER`",
+    "make room, or `lce-rig collect --rig RIG OTHER_DISK/session`",
 )
 DISK_SLOW = Kind(
     "computer.disk_slow",
     "too slow (minimum 20 MB/s)",
-    "collect on an SSD: `lce-rig collect --rig RIG -o FOLDER`",
+    "collect on an SSD: `lce-rig collect --rig RIG OTHER_DISK/session`",
 )
 DISK_NOT_WRITABLE = Kind(
     "computer.disk_not_writable",
     "{folder} cannot be written: {cause}",
-    "make room, or `lce-rig collect --rig RIG -o FOLDER`",
+    "make room, or `lce-rig collect --rig RIG OTHER_DISK/session`",
 )
 COMPUTER_CLOCK = note_kind("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms")
 COMPUTER_CLOCK_LOOSE = warning_kind(

@@ -155,7 +155,7 @@ def _typed(command):
             value = "other" if word == "OTHER_SESSION" else "session"
         typed.append(value)
     if typed[0] == "collect" and "--from" not in typed:
-        typed += ["--simulated", "--plain", "--silent", "--captures", "1", "--timeout", "60"]
+        typed += ["--simulated", "--plain", "--captures", "1", "--timeout", "60"]
     if first == "rigs new" and len(typed) == 3:
         typed += ["--from", "rlfs"]
     return tuple(typed)

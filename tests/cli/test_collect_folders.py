@@ -69,11 +69,10 @@ def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders,
     assert not (tmp_path / "session").exists()
 
 
-def test_a_session_is_named_by_output_too_and_continues_with_its_own_profile(lce_rig, folders, tmp_path):
+def test_a_session_continues_with_its_own_profile(lce_rig, folders, tmp_path):
     session = tmp_path / "session"
     first = ["--from", folders[0], "--camera", "left"]
-    assert lce_rig("collect", *first, "-o", session).code == 2, "a new session needs a rig"
-    assert lce_rig("collect", "--rig", TWO, *first, "-o", session).code == 0
+    assert lce_rig("collect", *first, session).code == 2, "a new session needs a rig"
+    assert lce_rig("collect", "--rig", TWO, *first, session).code == 0
     assert lce_rig("collect", session, "--from", folders[1], "--camera", "right").code == 0
     assert cameras_held(session) == [("left", 100), ("right", 101)]
-    assert lce_rig("collect", session, "-o", session, *first).code == 2

@@ -98,7 +98,6 @@ def open_view(
     is_plain: bool,
     has_keys: bool,
     links: tuple[str, ...] = (),
-    is_silent: bool = False,
     wants_code: Callable[[], bool] = lambda: False,
 ) -> Iterator[View]:
     """Open a screen where stderr is a terminal that can draw one, else, or where wanted, plain lines.
@@ -107,10 +106,9 @@ def open_view(
         is_plain: lines are wanted.
         has_keys: whether keys can be pressed.
         links: of the page, the likeliest first; a screen covers what was printed before it.
-        is_silent: no bell rings.
         wants_code: asked whether to show the page's QR code in place of the guidance.
     """
-    bell = Bell(is_silent or not sys.stderr.isatty())
+    bell = Bell(is_silent=not sys.stderr.isatty())
     if is_plain or not sys.stderr.isatty():
         yield PlainView(bell)
         return
