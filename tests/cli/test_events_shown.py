@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from lce_rig.core.calibration import Certificate, Metrics
 from lce_rig.core.geometry import invert
@@ -60,7 +61,8 @@ def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
     frame = cv2.imread(str(moving / "debug" / "davis.frames.lidar" / "000000.png"))
     assert drawn.shape[1] == frame.shape[1] == 1600 and drawn.shape[0] > frame.shape[0] + 300
     lower = drawn[drawn.shape[0] // 2 :, :800]
-    assert coloured(lower, BRIGHTER) > 500 and coloured(lower, DARKER) > 500
+    for name in (BRIGHTER, DARKER):
+        assert coloured(lower, [round(255 * each) for each in to_rgb(name)[::-1]]) > 500
 
 
 def test_verify_draws_the_lidar_for_each_channel(lce_rig, moving, tmp_path):

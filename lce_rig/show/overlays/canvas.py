@@ -1,6 +1,7 @@
 """Anti-aliased marks and text on BGR images, and their files; sizes follow the image's width."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,17 +19,11 @@ Colour = tuple[int, int, int]
 # not in the turbo scale.
 WHITE: Colour = (255, 255, 255)
 BLACK: Colour = (0, 0, 0)
-INK: Colour = (235, 235, 235)
 FAINT: Colour = (150, 150, 150)
-PANEL: Colour = (38, 34, 32)
 MAGENTA: Colour = (235, 60, 255)
 ORANGE: Colour = (60, 160, 255)
-BLUE: Colour = (255, 180, 90)
-GREEN: Colour = (110, 210, 90)
-RED: Colour = (90, 90, 255)
 
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Pictures have large even areas and thin marks: run lengths compress them as well as a search, in half the
 # time.
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
@@ -47,20 +42,20 @@ def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
     return np.asarray(bgr, dtype=np.uint8), factor
 
 
-def fitted(picture: Picture, width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
-    """Scale an image to fit into a box, centred on plain colour."""
-    scale = min(width_px / picture.shape[1], height_px / picture.shape[0])
-    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    box = panel(width_px, height_px, colour)
-    u, v = (width_px - size[0]) // 2, (height_px - size[1]) // 2
-    box[v : v + size[1], u : u + size[0]] = cv2.resize(picture, size, interpolation=how)
-    return box
+def show_image(axes: Any, pixels: Picture) -> None:
+    """Show an image, grey or BGR, in axes of Matplotlib, whose limits stay."""
+    rgb = pixels[..., ::-1] if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+    axes.imshow(rgb, interpolation="antialiased")
+    axes.autoscale(False)
 
 
-def panel(width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
-    """Make a plain image."""
-    return np.full((height_px, width_px, 3), colour, dtype=np.uint8)
+def rendered(figure: Any) -> Picture:
+    """Draw a figure of Matplotlib."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    drawn: Any = FigureCanvasAgg(figure)
+    drawn.draw()
+    return np.ascontiguousarray(np.asarray(drawn.buffer_rgba())[..., 2::-1])
 
 
 def accumulated(events: Events) -> Picture:
@@ -119,29 +114,6 @@ def draw_line(
         if casing is not None:
             cv2.polylines(picture, path, False, casing, width_px + 2, cv2.LINE_AA, _SHIFT)
         cv2.polylines(picture, path, False, colour, width_px, cv2.LINE_AA, _SHIFT)
-
-
-def draw_text(
-    picture: Picture,
-    text: str,
-    left_px: float,
-    baseline_px: float,
-    height_px: float,
-    colour: Colour = INK,
-    align: float = 0.0,
-) -> None:
-    """Write one line of ASCII text whose capitals are `height_px` high; align 0 left, 0.5 centre, 1 right."""
-    scale = height_px / 22.0
-    left = left_px - align * text_width_px(text, height_px)
-    weight = max(1, round(height_px / 13))
-    origin = (round(left), round(baseline_px))
-    cv2.putText(picture, text, origin, _FONT, scale, colour, weight, cv2.LINE_AA)
-
-
-def text_width_px(text: str, height_px: float) -> float:
-    """Measure the width of a line of text."""
-    (width, _), _ = cv2.getTextSize(text, _FONT, height_px / 22.0, max(1, round(height_px / 13)))
-    return float(width)
 
 
 def _fixed(pixels: Array) -> list[list[int]]:

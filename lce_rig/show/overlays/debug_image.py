@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
-import cv2
 import numpy as np
 
 from lce_rig.core.board import Board
@@ -16,13 +15,11 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.image.corners import find_grid, seen_grid
 from lce_rig.detect.image.markers import marker_corners
-from lce_rig.show.overlays import canvas
-from lce_rig.show.overlays.canvas import BLACK, BLUE, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
-from lce_rig.show.overlays.overlay import draw_image_board, range_limits
+from lce_rig.show.overlays.canvas import Picture, rendered, show_image
+from lce_rig.show.overlays.overlay import range_limits
 
-# BGR; they also differ in lightness.
-BRIGHTER: Colour = (70, 70, 255)
-DARKER: Colour = (255, 150, 60)
+# They also differ in lightness.
+BRIGHTER, DARKER = "#ff4646", "#3c96ff"
 # For a slow board all events of this time are drawn, for a fast one the latest per pixel.
 _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
@@ -63,7 +60,6 @@ def draw_debug(
     Returns:
         (H, 1600, 3) uint8 BGR.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.style import context
 
@@ -77,7 +73,6 @@ def draw_debug(
     height_in = sum(heights_in) + 0.4
     with context("dark_background"):
         figure: Any = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI)
-        drawn: Any = FigureCanvasAgg(figure)
         at = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 1 - 0.5 / height_in}
         panes = figure.subplot_mosaic(
             rows, height_ratios=heights_in, gridspec_kw=at | {"hspace": 0.12, "wspace": 0.1}
@@ -86,47 +81,39 @@ def draw_debug(
         for name in panes.keys() & {"camera", "events", "face", "seen", "scan"}:
             panes[name].set_axis_off()
         if image is not None:
-            _show(panes["camera"], _camera_picture(image, image_result, board, intrinsics))
+            _draw_camera(panes["camera"], image, image_result, board, intrinsics)
             if events is not None:
-                _show(panes["events"], _event_picture(image, events, image_result, board, intrinsics))
+                _draw_events(panes["events"], image, events, image_result, board, intrinsics)
         _draw_scan(panes, scan, lidar_result, board, chosen, mismatch)
         _write(panes["seen"], "camera", image_result if isinstance(image_result, Refusal) else None)
         _write(panes["scan"], "LiDAR", lidar_result if isinstance(lidar_result, Refusal) else mismatch)
-        drawn.draw()
-    return np.ascontiguousarray(np.asarray(drawn.buffer_rgba())[..., 2::-1])
+        return rendered(figure)
 
 
-def _show(axes: Any, picture: Picture) -> None:
-    axes.imshow(picture[..., ::-1], interpolation="antialiased")
-
-
-def _camera_picture(
-    image: Image, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics
-) -> Picture:
+def _draw_camera(
+    axes: Any, image: Image, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics
+) -> None:
     """Draw the board that was detected, or the corners in a refused image, of the pattern or a part of it."""
-    picture, factor = canvas.enlarged(image.pixels)
-    unit = picture.shape[1] / 1000
+    show_image(axes, image.pixels)
     if isinstance(result, ImageBoard):
-        draw_image_board(picture, factor, result, board, intrinsics)
+        axes.plot(*outline_px(result.T_cam_board, board, intrinsics).T, color="white")
+        axes.plot(*result.corners_px.T, ".", color="white", markersize=4)
         # The first corner, its row (x) and its column (-y), so that a flipped order is visible.
         predicted_px, _ = intrinsics.project(transform(result.T_cam_board, board.corners()))
         corners_px = np.where(np.isfinite(result.corners_px), result.corners_px, predicted_px)
-        grid = ((corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
-        canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
-        canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
-        canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
-        left, baseline = grid[0, -1] + 8 * unit
-        canvas.draw_text(picture, "x", float(left), float(baseline), 16 * unit, ORANGE)
-        return picture
+        grid_px = corners_px.reshape(board.rows, board.cols, 2)
+        axes.plot(*grid_px[0].T, color=_REFUSED)
+        axes.plot(*grid_px[:, 0].T, color=_FOUND)
+        axes.plot(*grid_px[0, 0], "o", color=_CHOSEN, mec="white")
+        axes.text(*grid_px[0, -1], " x", color=_REFUSED)
+        return
     if board.has_markers:
-        grid_px: Array | None = marker_corners(image.grey, board)
+        found_px: Array | None = marker_corners(image.grey, board)
     else:
         whole = find_grid(image.grey, board, is_thorough=False)
-        grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
-    if grid_px is not None:
-        pixels = (grid_px.reshape(-1, 2) + 0.5) * factor - 0.5
-        canvas.draw_discs(picture, pixels, ORANGE, max(1.5, 2.5 * unit), BLACK)
-    return picture
+        found_px = seen_grid(image.grey) if whole is None else whole.grid_px
+    if found_px is not None:
+        axes.plot(*found_px.reshape(-1, 2).T, "o", color=_REFUSED, markersize=4, mec="black")
 
 
 def recent_events(image: Image, events: Events) -> Events:
@@ -137,54 +124,25 @@ def recent_events(image: Image, events: Events) -> Events:
     return recent.select(slice(max(0, len(recent) - n_most), len(recent)))
 
 
-def draw_events(image: Image, events: Events) -> tuple[Picture, int]:
-    """Draw events over their image, dimmed, enlarged.
-
-    Args:
-        image: the image.
-        events: each pixel gets the colour of the majority of its events.
-
-    Returns:
-        The drawing (H, W, 3) BGR and the factor, as `canvas.enlarged`.
-    """
-    picture, factor = canvas.enlarged(image.pixels)
-    dimmed = picture.astype(np.float32) * _DIM + 30
-    shape = image.pixels.shape[:2]
-    sums = np.zeros(shape, dtype=np.int32)
-    is_inside = (events.x < shape[1]) & (events.y < shape[0])
-    inside = events.select(is_inside)
-    np.add.at(sums, (inside.y, inside.x), np.where(inside.polarity, 1, -1))
-    for is_coloured, colour in ((sums > 0, BRIGHTER), (sums < 0, DARKER)):
-        large = cv2.resize(
-            is_coloured.astype(np.uint8), None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST
-        )
-        dimmed[large > 0] = colour
-    return np.asarray(np.clip(dimmed, 0, 255), dtype=np.uint8), factor
-
-
-def _event_picture(
-    image: Image, events: Events, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics
-) -> Picture:
+def _draw_events(
+    axes: Any,
+    image: Image,
+    events: Events,
+    result: ImageBoard | Refusal,
+    board: Board,
+    intrinsics: Intrinsics,
+) -> None:
     """Draw recent events over the image, and in grey from where and to where the board was tracked."""
-    events = recent_events(image, events)
-    picture, factor = draw_events(image, events)
+    shown = recent_events(image, events)
+    show_image(axes, (_DIM * image.pixels).astype(np.uint8))
+    for is_kind, colour in ((shown.polarity, BRIGHTER), (~shown.polarity, DARKER)):
+        axes.plot(shown.x[is_kind], shown.y[is_kind], "s", color=colour, markersize=2, mew=0)
     if isinstance(result, ImageBoard):
-        track = result.track_T_cam_board
-        ends = [] if track is None else [(track[0], (110, 110, 110)), (track[-1], (170, 170, 170))]
-        for T_cam_board, colour in [*ends, (result.T_cam_board, WHITE)]:
-            pixels = (outline_px(T_cam_board, board, intrinsics) + 0.5) * factor - 0.5
-            canvas.draw_line(picture, pixels, colour, 1, None)
-    picture[:24] = BLACK
-    span_ms = 1e-6 * float(events.t_ns[-1] - events.t_ns[0]) if len(events) else 0.0
-    left_px, text_px = 8.0, 10
-    for text, colour in (
-        (f"events of the last {span_ms:.{0 if span_ms >= 10 else 1}f} ms:", INK),
-        ("brighter", BRIGHTER),
-        ("darker", DARKER),
-    ):
-        canvas.draw_text(picture, text, left_px, 16, text_px, colour)
-        left_px += canvas.text_width_px(text, text_px) + text_px
-    return picture
+        track = () if result.track_T_cam_board is None else result.track_T_cam_board[[0, -1]]
+        for T_cam_board, colour in (*((T, "0.5") for T in track), (result.T_cam_board, "white")):
+            axes.plot(*outline_px(T_cam_board, board, intrinsics).T, color=colour, linewidth=1)
+    span_ms = 1e-6 * float(shown.t_ns[-1] - shown.t_ns[0]) if len(shown) else 0.0
+    axes.set_title(f"events of the last {span_ms:.1f} ms: red brighter, blue darker", loc="left", fontsize=9)
 
 
 def _draw_scan(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,12 +30,13 @@ from lce_rig.show.overlays.canvas import BLACK, FAINT, MAGENTA, ORANGE, WHITE, P
 from lce_rig.show.page import render
 
 PAGE = "index.html"
-_PAGE_PX = 1600
+_WIDTH_IN = 16
 _FOLD_MARGIN = 0.9
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
 # Scans that choose the range scale of a session's images.
 _SCANS_OF_SCALE = 8
+_GROUND = (38, 34, 32)
 _WINDOW = Intrinsics(640.0, 640.0, 639.5, 359.5, 1280, 720)
 
 
@@ -106,20 +108,19 @@ def draw_edges(
     Returns:
         BGR (H, W, 3).
     """
-    width_px = _PAGE_PX // len(poses)
-    panels = []
-    for name, T_cam_lidar in poses.items():
-        picture, factor = canvas.enlarged(image.pixels)
+    from matplotlib.figure import Figure
+
+    height_in = _WIDTH_IN / len(poses) * image.pixels.shape[0] / image.pixels.shape[1]
+    figure: Any = Figure(figsize=(_WIDTH_IN, height_in + 0.3), dpi=100)
+    panes = figure.subplots(1, len(poses), squeeze=False)[0]
+    figure.subplots_adjust(0, 0, 1, height_in / (height_in + 0.3), wspace=0.01)
+    for axes, (name, T_cam_lidar) in zip(panes, poses.items(), strict=True):
+        canvas.show_image(axes, image.pixels)
         pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
-        at = (pixels[intrinsics.is_inside(pixels)] + 0.5) * factor - 0.5
-        canvas.draw_discs(picture, at, MAGENTA, 2.2e-3 * picture.shape[1], BLACK)
-        picture = canvas.fitted(picture, width_px, round(width_px * picture.shape[0] / picture.shape[1]))
-        strip = canvas.panel(width_px, 40)
-        canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13)
-        # Between images as white as the page, such as those of events.
-        picture[:, -2:] = BLACK
-        panels.append(np.vstack([strip, picture]))
-    return np.hstack(panels)
+        axes.plot(*pixels[intrinsics.is_inside(pixels)].T, "o", color="magenta", markersize=4, mec="black")
+        axes.set_axis_off()
+        axes.set_title(f"{title}  {name}", loc="left")
+    return canvas.rendered(figure)
 
 
 def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
@@ -318,6 +319,6 @@ def draw_cloud(scan: Scan, T_view: Array) -> Image:
     points = transform(T_view, scan.points[np.isfinite(scan.points).all(axis=1)])
     pixels, is_valid = _WINDOW.project(points)
     is_seen = is_valid & (points[:, 2] > 0) & _WINDOW.is_inside(pixels, -0.5)
-    picture = canvas.panel(_WINDOW.width_px, _WINDOW.height_px)
+    picture = np.full((_WINDOW.height_px, _WINDOW.width_px, 3), _GROUND, np.uint8)
     canvas.draw_discs(picture, pixels[is_seen], FAINT, 1.6)
     return Image(scan.sensor, "", scan.stamp_ns, picture)
