@@ -32,15 +32,14 @@ _QUALITY = 75
 _MAX_LOG = 50
 
 
-def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
+def to_json(state: LiveState, *, has_picture: bool) -> str:
     """Write a state, without its image, for the page; what is not known is null.
 
     Args:
         state: the state.
-        update: a number that the page answers with once it has shown the state.
         has_picture: whether a JPEG of the drawing follows.
     """
-    document = state._asdict() | {"update": update, "log": state.log[-_MAX_LOG:]}
+    document = state._asdict() | {"log": state.log[-_MAX_LOG:]}
     if state.drawing is not None:
         height, width = state.drawing.pixels.shape[:2]
         document["drawing"] = {
@@ -131,13 +130,9 @@ _LOOK_S = 0.03
 PERIOD_S = 0.1
 #: Without news the page gets a message this often, and so knows that it is still connected.
 BEAT_S = 1.0
-#: Updates under way to a page. Two hide the time of their way; more would only grow old in buffers.
-MAX_UNDER_WAY = 2
 MAX_MESSAGE_BYTES = 256
-#: A page that shows no update for so long sleeps; it connects again when it wakes.
+#: A page that answers nothing for so long sleeps, or is out of range; it connects again when it wakes.
 ANSWER_S = 5.0
-#: A page that does not answer a ping for so long is gone: a phone out of range says no goodbye.
-HEARTBEAT_S = 10.0
 _GOODBYE_S = 0.5
 _COOKIE = "lce_rig_preview"
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
@@ -195,8 +190,8 @@ class Feed:
 class Viewer:
     """Feeds one open page with the newest state as fast as it can follow, and no faster.
 
-    The page answers each update with its number once it is on the screen, and images are sent to pages that
-    are looked at. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
+    The page answers each message once it is on the screen, and says whether it is looked at: only then are
+    images sent. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
     from it.
     """
 
@@ -204,26 +199,27 @@ class Viewer:
         self._line = line
         self._feed = feed
         self._encoder = encoder
-        self._n_sent = 0
-        self._n_shown = 0
         self._is_looked_at = True
         self._state = 0
         self._delivered = 0
         self._pixels: Pixels | None = None
-        self._has_room = asyncio.Event()
-        self._has_room.set()
 
     async def serve(self) -> None:
-        """Feed the page until it goes away."""
-        tasks = {asyncio.create_task(self._read()), asyncio.create_task(self._write())}
-        try:
-            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in ended:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+        """Feed the page until it goes away, sleeps or sends what no page sends."""
+        is_answered = True
+        with suppress(ConnectionError, asyncio.TimeoutError):
+            while is_answered:
+                is_new = await self._feed.wait_beyond(self._state, BEAT_S)
+                began_s, newest = time.monotonic(), self._feed.newest()
+                if is_new and newest is not None:
+                    self._state, state = newest
+                    await asyncio.wait_for(self._send(state), ANSWER_S)
+                    self._delivered = newest[0]
+                else:
+                    await self._line.send_str(beat(self._feed.age_s()))
+                is_answered = await self._read_answer()
+                await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
+            await self._line.close(code=1008, message=b"only answers and requests are read")
 
     async def close(self) -> None:
         """Let the page have the last state, for a moment, and close the connection."""
@@ -236,64 +232,34 @@ class Viewer:
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), _GOODBYE_S)
 
-    async def _read(self) -> None:
-        async for received in self._line:
-            if received.type is not WSMsgType.TEXT or not self._take(received.data):
-                await self._line.close(code=1008, message=b"only answers and requests are read")
-                return
-
-    async def _write(self) -> None:
-        with suppress(ConnectionError, asyncio.TimeoutError):  # the page went away, or sleeps
-            while True:
-                await asyncio.wait_for(self._has_room.wait(), ANSWER_S)
-                if not await self._feed.wait_beyond(self._state, BEAT_S):
-                    await self._line.send_str(beat(self._feed.age_s()))
-                    continue
-                began_s = time.monotonic()
-                newest = self._feed.newest()
-                assert newest is not None
-                self._state, state = newest
-                await self._send(state)
-                self._delivered = newest[0]
-                await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
-
     async def _send(self, state: LiveState) -> None:
         jpeg = None
         if state.drawing is not None and self._is_looked_at and state.drawing.pixels is not self._pixels:
             self._pixels = state.drawing.pixels
             jpeg = await self._encoder.encode(state.drawing.pixels)
-        self._n_sent += 1
-        if self._n_sent - self._n_shown >= MAX_UNDER_WAY:
-            self._has_room.clear()
-        await self._line.send_str(to_json(state, self._n_sent, has_picture=jpeg is not None))
+        await self._line.send_str(to_json(state, has_picture=jpeg is not None))
         if jpeg is not None:
             await self._line.send_bytes(jpeg)
 
-    def _take(self, text: str) -> bool:
-        """Take {"shown": update, "visible": bool} or {"take_back": name}; False where it is neither."""
-        try:
-            answer = json.loads(text)
-            name = answer.get("take_back")
-            shown, is_looked_at = (0, True) if name is not None else (answer["shown"], answer["visible"])
-        except (ValueError, AttributeError, KeyError, RecursionError):
-            return False
-        if name is not None:
-            if not isinstance(name, str) or not re.fullmatch(r"[0-9]{6,20}", name):
+    async def _read_answer(self) -> bool:
+        """Read up to {"visible": bool}, and requests {"take_back": name}; False where it is neither."""
+        while True:
+            received = await self._line.receive(ANSWER_S)
+            try:
+                said = json.loads(received.data) if received.type is WSMsgType.TEXT else None
+            except (ValueError, RecursionError):
                 return False
-            self._feed.ask(TakeBack(name))
-            return True
-        if type(shown) is not int or type(is_looked_at) is not bool:
-            return False
-        if not self._n_shown <= shown <= self._n_sent:
-            return False
-        self._n_shown = shown
-        if is_looked_at and not self._is_looked_at:
-            # What was sent meanwhile had no image.
-            self._pixels, self._state = None, 0
-        self._is_looked_at = is_looked_at
-        if self._n_sent - self._n_shown < MAX_UNDER_WAY:
-            self._has_room.set()
-        return True
+            match said:
+                case {"visible": bool(is_looked_at)}:
+                    if is_looked_at and not self._is_looked_at:
+                        # What was sent meanwhile had no image.
+                        self._pixels, self._state = None, 0
+                    self._is_looked_at = is_looked_at
+                    return True
+                case {"take_back": str(name)} if re.fullmatch(r"[0-9]{6,20}", name):
+                    self._feed.ask(TakeBack(name))
+                case _:
+                    return False
 
 
 class Pages:
@@ -354,9 +320,7 @@ class Pages:
         return response
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        line = web.WebSocketResponse(
-            heartbeat=HEARTBEAT_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=_GOODBYE_S
-        )
+        line = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, timeout=_GOODBYE_S)
         await line.prepare(request)
         viewer = Viewer(line, self._feed, self.encoder)
         self._viewers.add(viewer)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.show.phone.pages import MAX_UNDER_WAY, MAX_WIDTH_PX, encode_picture
+from lce_rig.show.phone.pages import MAX_WIDTH_PX, encode_picture
 from lce_rig.show.phone.preview import Preview
 
 from .conftest import PRESENT_PX, picture, port_of, state
@@ -87,7 +87,7 @@ def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pag
             shown = quick.next_state()[0]["n_captures"]
         assert statistics.median(took_s) < 1e-3
         got = stuck.receive_all(quiet_s=0.5)
-        assert sum(isinstance(message, dict) for message in got) <= MAX_UNDER_WAY
+        assert sum(isinstance(message, dict) for message in got) <= 1
 
 
 def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
@@ -108,15 +108,16 @@ def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "no json", "[]", "{}", '{"shown": 5, "visible": true}', '{"shown": true, "visible": true}',
-     '{"shown": 0, "visible": 1}', '{"shown": -1, "visible": true}', "[" * 200, "x" * 5000,
+    ["", "no json", "[]", "{}", '{"visible": 1}', "true", "[" * 200, "x" * 5000,
      '{"take_back": 6}', '{"take_back": "../../etc"}', '{"take_back": ""}', "7", '"take_back"'],
 )  # fmt: skip
 def test_what_no_page_sends_ends_its_connection_only(preview, text):
     with Watcher(preview.urls[0]) as odd, Watcher(preview.urls[0]) as other:
         odd.watch()
         odd.send(text)
-        assert odd.receive() in (1008, 1009)
+        while isinstance(closed := odd.receive(), dict):
+            assert "beat" in closed
+        assert closed in (1008, 1009)
         preview.publish(state())
         other.watch()
         assert other.next_state()[0]["n_captures"] == 7
@@ -145,7 +146,9 @@ def test_pages_have_the_last_state_when_the_collection_ends():
     preview = Preview(port=0)
     with Watcher(preview.start()) as watcher:
         watcher.watch()
-        for k in range(5):
+        preview.publish(state(n_captures=0))
+        watcher.next_state()
+        for k in range(1, 5):
             preview.publish(state(n_captures=k))
         preview.publish(state(phase="ended", n_captures=9))
         closer = threading.Thread(target=preview.close)
@@ -168,10 +171,9 @@ def test_closing_does_not_wait_for_pages_whose_line_is_full():
         full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
         full.connect(("127.0.0.1", port))
         full.sendall(ask_for_states(port, query))
-        for n in (1, 2):
-            preview.publish(state(drawing=Drawing("cam", noise.copy())))
-            while preview.n_pictures < n:
-                time.sleep(0.02)
+        preview.publish(state(drawing=Drawing("cam", noise)))
+        while not preview.n_pictures:
+            time.sleep(0.02)
         preview.close()
         # Its thread has ended too, and left no connection behind.
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]

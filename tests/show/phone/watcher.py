@@ -59,14 +59,14 @@ class Watcher:
     def next_state(self, visible=True):
         """Give the next state and its picture, and answer that it is on the screen."""
         while "beat" in (state := self.receive()):
-            pass
+            self.answer(visible)
         has_picture = state["drawing"] is not None and state["drawing"]["has_picture"]
         jpeg = self.receive() if has_picture else None
-        self.answer(state["update"], visible)
+        self.answer(visible)
         return state, jpeg
 
-    def answer(self, shown, visible=True):
-        self.send(json.dumps({"shown": shown, "visible": visible}))
+    def answer(self, visible=True):
+        self.send(json.dumps({"visible": visible}))
 
     def send(self, text):
         self._run(self.socket.send_str(text))

@@ -1,4 +1,4 @@
-// The line to the rig: updates in the order they were sent, each answered once it is on the screen.
+// The line to the rig: one message at a time, answered once it is on the screen.
 
 const RETRY_MS = [300, 600, 1000, 2000];
 const DEAD_MS = 3500; // the rig sends something every second
@@ -15,45 +15,28 @@ export function connect(onState, onLine, onBeat) {
   let tries = 0;
   let socket = null;
   let lastHeard = 0;
-  let lastShown = 0;
-
-  function answer() {
-    if (socket !== null && socket.readyState === WebSocket.OPEN) {
-      socket.send(JSON.stringify({ shown: lastShown, visible: !document.hidden }));
-    }
-  }
 
   function open() {
     const line = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
     line.binaryType = "blob";
     socket = line;
     lastHeard = performance.now();
-    lastShown = 0;
     let waiting = null;
-    let shown = Promise.resolve();
-
-    function show(state, picture) {
-      shown = shown.then(() => onState(state, picture)).catch((error) => console.error(error)).then(() => {
-        if (socket !== line) return;
-        lastShown = state.update;
-        answer();
-      });
-    }
     line.onopen = () => {
       tries = 0;
-      if (document.hidden) answer();
       onLine(true, false);
     };
-    line.onmessage = ({ data }) => {
+    line.onmessage = async ({ data }) => {
       lastHeard = performance.now();
-      if (typeof data !== "string") {
-        show(waiting, data);
+      const isPicture = typeof data !== "string";
+      const message = isPicture ? waiting : JSON.parse(data);
+      if (!isPicture && message.drawing?.has_picture) {
+        waiting = message;
         return;
       }
-      const message = JSON.parse(data);
       if (message.beat) onBeat(message.age_s);
-      else if (message.drawing !== null && message.drawing.has_picture) waiting = message;
-      else show(message, null);
+      else await onState(message, isPicture ? data : null).catch((error) => console.error(error));
+      if (line.readyState === WebSocket.OPEN) line.send(JSON.stringify({ visible: !document.hidden }));
     };
     line.onclose = () => socket === line && lost();
   }
@@ -77,7 +60,6 @@ export function connect(onState, onLine, onBeat) {
       lost();
     }
   }, 500);
-  document.addEventListener("visibilitychange", answer);
   open();
   return (name) => {
     if (socket !== null && socket.readyState === WebSocket.OPEN) {
