@@ -314,7 +314,7 @@ class Registry:
         Args:
             columns: their names; None for all.
             where: condition in SQL, such as "verdict = 'fail' and date > '2026-01-01'" or
-                "list_contains(findings, 'verdict.changed')"; "" for all rows.
+                "list_contains(findings, 'verdict.moved')"; "" for all rows.
 
         Raises:
             SessionError: there is no table, or it cannot be read.

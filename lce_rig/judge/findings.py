@@ -9,7 +9,7 @@ from lce_rig.core.phrasing import fill
 
 Verdict = Literal["pass", "marginal", "fail"]
 _OF_DISTANCES = (
-    "verdict.two_groups verdict.shares_differ "
+    "verdict.shares_differ "
     "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "
     "verdict.translation_uncertain verdict.scene verdict.scene_not_used "
 )
@@ -24,8 +24,6 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
     "verdict.lidars_exchanged": _OF_POSES.split(),
     "verdict.moved": _OF_POSES.split(),
-    "verdict.changed": _OF_POSES.split(),
-    "verdict.camera_changed": _OF_POSES.split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
     "verdict.plate_edge": [
         "verdict.pattern_offset",
@@ -36,12 +34,11 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.laser_angles": _OF_POSES.split(),
     "verdict.lens_model": f"{_OF_POSES}verdict.intrinsics verdict.pattern_offset".split(),
     "verdict.intrinsics": (
-        f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ "
+        f"{_OF_DISTANCES}verdict.moved verdict.scale verdict.far_from_nominal verdict.cameras_differ "
         "verdict.planes_apart verdict.sensors_disagree verdict.few_used".split()
     ),
-    "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
-    "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.planes_apart".split(),
-    "verdict.two_groups": _OF_SIGMAS,
+    "verdict.scale": f"{_OF_DISTANCES}verdict.moved verdict.sensors_disagree verdict.planes_apart".split(),
+    "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.moved verdict.planes_apart".split(),
     "verdict.shares_differ": _OF_SIGMAS,
     "verdict.cameras_differ": _OF_SIGMAS,
     "verdict.channels_differ": _OF_SIGMAS,
@@ -253,10 +250,12 @@ def _moved(finding: Finding) -> str:
 
     {neighbour} lies before or after them; {chance}: to differ as much on one mounting.
     """
-    place, text = finding.figures["place"], f"fit a mounting changed by {_APART}: a sensor moved "
-    text = fill("{n_captures} captures ({captures:few}) " + text, finding.figures)
+    place = finding.figures["place"]
+    text = fill("{n_captures} captures ({captures:few}) fit a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
-    return f"{f'the {place} ' if place else ''}{text}{fill(when, finding.figures)}"
+    cameras = f"{finding.subject} in their images: " if finding.subject else ""
+    which = f"the {place} " if place else ""
+    return f"{cameras}{which}{text}: a sensor moved {fill(when, finding.figures)}"
 
 
 def _agree(finding: Finding) -> str:
@@ -371,23 +370,12 @@ INTRINSICS_FIT = Kind(
     "intrinsics.fit", "the profile's intrinsics fit the boards of the session", "keep them", severity="note"
 )
 INTRINSICS_UNDETERMINED = Kind("intrinsics.undetermined", _reach, _CORNERS_TOO, severity="warning")
-CHANGED = Kind(
-    "verdict.changed",
-    "extrinsics change significantly at capture {capture}, by " + _APART,
-    "fasten the sensors, one may have moved, and collect again",
-)
 MOVED = Kind("verdict.moved", _moved, "fasten the sensors and collect again")
 LAST_REJECTED = Kind(
     "verdict.last_rejected",
     "the last capture, {capture}, is an outlier, and none after it shows whether a sensor moved",
     "collect two more captures",
     severity="note",
-)
-TWO_GROUPS = Kind(
-    "verdict.two_groups",
-    "{n_captures} captures ({captures}) fit other extrinsics than the rest, significantly, by " + _APART,
-    "fasten the sensors, one may have moved to and fro, and collect again",
-    severity="warning",
 )
 SHARES_DIFFER = Kind(
     "verdict.shares_differ",
@@ -411,11 +399,6 @@ LASER_ANGLES = Kind(
     "verdict.laser_angles",
     "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
     "check the LiDAR's model and beam table in its driver",
-)
-CAMERA_CHANGED = Kind(
-    "verdict.camera_changed",
-    "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,
-    "fasten the cameras, one may have moved, and collect again",
 )
 CAMERAS_EXCHANGED = Kind(
     "verdict.cameras_exchanged",

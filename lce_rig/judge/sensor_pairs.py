@@ -262,9 +262,10 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
     """
     if pair.from_images is None or pair.apart is None:
         return []
-    halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
+    seen = pair.from_images
+    halves = contrast_halves(seen.expansion, seen.centres, seen.captures)
     cameras = " to ".join(names)
-    findings = split_findings(halves, pair.from_images.captures, target, cameras)
+    findings = split_findings(halves, target, cameras)
     images_rms_m = pair.from_images.board_rms_m
     excess = target.excess(pair.apart)
     if excess > 1:

@@ -7,7 +7,7 @@ looked for: those of a sensor that moved to and fro.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, chance_of, tangent_sizes
-from lce_rig.judge.findings import (
-    CAMERA_CHANGED,
-    CHANGED,
-    MOVED,
-    SHARES_DIFFER,
-    TWO_GROUPS,
-    failing,
-)
+from lce_rig.judge.findings import MOVED, SHARES_DIFFER, failing
 from lce_rig.rig import CalibrationSettings
 
 LEAST_CHANCE = 0.001
@@ -66,42 +59,31 @@ _MEAN_GAIN = 0.65
 _MIN_END, _DIFFERS = 2, 0.05
 
 
-class RejectedGroup(NamedTuple):
-    """Captures, at least half of them rejected, that agree on extrinsics of their own.
-
-    Attributes:
-        captures: their names.
-        place: "last" or "first" in time; "" where others lie between them.
-        neighbour: the capture before the last ones, or after the first ones.
-    """
-
-    captures: tuple[str, ...]
-    place: str
-    neighbour: str
-
-
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """Two subsets of the captures, calibrated separately.
+    """Two subsets of the captures, calibrated separately: boards at two places, or a mounting and another.
 
     Attributes:
-        first, second: their names, such as "near" and "far".
+        first, second: their names, such as "near" and "far"; of mountings "before" and "after", or "group"
+            and "rest" where no order tells them.
         apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
         chance: probability that random subsets differ as much, in units of their noise.
-        n_first: number of captures in the first subset.
-        group: indices of the first subset's captures, where no order tells them.
+        captures: the fewer ones, of a mounting of their own; none of boards at two places.
+        place: "last" or "first" of these in time; "" where others lie between them.
+        neighbour: the capture before the last ones, or after the first ones.
         is_noise_known: whether `chance` is that of a known noise, not of one measured by the captures.
-        rejected: the captures of one subset, where they were rejected as outliers.
+        is_rejected: whether half of these captures or more were rejected as outliers.
     """
 
     first: str
     second: str
     apart: Array
     chance: float
-    n_first: int
-    group: tuple[int, ...] = ()
+    captures: tuple[str, ...] = ()
+    place: str = ""
+    neighbour: str = ""
     is_noise_known: bool = False
-    rejected: RejectedGroup | None = None
+    is_rejected: bool = False
 
     @property
     def is_change(self) -> bool:
@@ -109,35 +91,27 @@ class Contrast:
         return self.first == "before"
 
     @property
-    def is_of_places(self) -> bool:
-        """Whether the subsets are boards at two places: near and far, left and right, upper and lower."""
-        return not (self.is_change or self.group or self.rejected)
-
-    def minority(self, captures: Sequence[str]) -> Sequence[str]:
-        """Name the captures of a mounting of their own, of those in the order in which they were taken."""
-        if self.rejected is not None:
-            return self.rejected.captures
-        if self.group:
-            return [captures[k] for k in self.group]
-        n = self.n_first if self.is_change else 0
-        return captures[:n] if 2 * n < len(captures) else captures[n:]
+    def is_group(self) -> bool:
+        """Whether the captures used are shared out without regard to their order."""
+        return self.first == "group" and not self.is_rejected
 
     def excess(self, target: CalibrationSettings, max_change: float = _MAX_CHANGE) -> float:
         """Measure the difference in units of its limit; 0 if random subsets may differ as much."""
         if self.chance > LEAST_CHANCE:
             return 0.0
         limit = max_change if self.is_change else _MAX_CONTRAST
-        if self.group and (self.is_noise_known or self.chance < _CERTAIN * LEAST_CHANCE):
+        if self.is_group and (self.is_noise_known or self.chance < _CERTAIN * LEAST_CHANCE):
             limit = 1.0
         return target.in_targets(*tangent_sizes(self.apart)) / limit
 
 
-def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ...]:
+def contrast_halves(expansion: Quadratics, centres: Array, captures: Sequence[str]) -> tuple[Contrast, ...]:
     """Compare subsets that should agree.
 
     Args:
         expansion: of F captures in the order in which they were taken, settled.
         centres: (F, 3) middle of the board in each, frame camera, m.
+        captures: their names.
 
     Returns:
         Subsets before and after the capture of the largest change, near and far, left and right, upper and
@@ -157,7 +131,7 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     changes = [(chance_of(chi2[best] / unit, 6), apart[best], int(cuts[best]))]
     changes += [_change_at_end(expansion, cut) for cut in (2, n - 2)]
     chance, tangent, cut = min(changes, key=lambda change: change[0])
-    found = [Contrast("before", "after", tangent, min((len(cuts) + 2) * chance, 1.0), cut)]
+    found = [_change(tangent, min((len(cuts) + 2) * chance, 1.0), cut, captures)]
     for first, second, key in (
         ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
@@ -165,8 +139,19 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     ):
         is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
         chi2, apart = _chi2(expansion, is_first)
-        found.append(Contrast(first, second, apart[0], chance_of(chi2[0] / unit, 6), int(is_first.sum())))
+        found.append(Contrast(first, second, apart[0], chance_of(chi2[0] / unit, 6)))
     return tuple(found)
+
+
+def _change(
+    apart: Array, chance: float, cut: int, captures: Sequence[str], *, is_noise_known: bool = False
+) -> Contrast:
+    """Compare the captures before a cut with those after it; the fewer ones are of another mounting."""
+    if 2 * cut < len(captures):
+        fewer, place, neighbour = captures[:cut], "first", captures[cut]
+    else:
+        fewer, place, neighbour = captures[cut:], "last", captures[cut - 1]
+    return Contrast("before", "after", apart, chance, tuple(fewer), place, neighbour, is_noise_known)
 
 
 def _change_at_end(expansion: Quadratics, cut: int) -> tuple[float, Array, int]:
@@ -203,7 +188,7 @@ def _noise(expansion: Quadratics, among: Array) -> float:
     return max(float(np.median(by_lot)) / MEDIAN_CHI2, 1e-12)
 
 
-def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
+def find_groups(expansion: Quadratics, captures: Sequence[str]) -> tuple[Contrast, ...]:
     """Look for two groups of captures with extrinsics of their own, whatever their order.
 
     Placements are shared out so that two extrinsics x_1 and x_2 explain them best (k-means with the captures'
@@ -216,6 +201,7 @@ def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
 
     Args:
         expansion: of F captures, settled.
+        captures: their names.
 
     Returns:
         The smaller group compared with the rest; none for fewer than 8 placements.
@@ -246,11 +232,15 @@ def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
     smaller = is_first[0] if 2 * is_first[0].sum() <= n else ~is_first[0]
     shares = smaller @ expansion.groups
     _, apart = _chi2(expansion, shares[None])
-    members = np.flatnonzero(shares)
-    return (Contrast("group", "rest", apart[0], chance, len(members), tuple(members.tolist())),)
+    return (Contrast("group", "rest", apart[0], chance, _named(captures, shares)),)
 
 
-def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, ...]:
+def _named(captures: Sequence[str], shares: Array) -> tuple[str, ...]:
+    """Name the captures whose share (F,) is not zero."""
+    return tuple(name for name, share in zip(captures, shares, strict=True) if share)
+
+
+def find_turned(turns: Array, centres: Array, groups: Array, captures: Sequence[str]) -> tuple[Contrast, ...]:
     """Look for boards turned differently about their lines of sight: two groups, and before and after.
 
     A turn of the image moves ring ends along the edges, which their own cost tells more accurately than
@@ -262,6 +252,7 @@ def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, 
         turns: (2, F) angle of each capture, rad, and standard deviation.
         centres: (F, 3) middle of the board in each, frame camera, m.
         groups: (n, F) 1 where a capture shows a placement, whose captures have the same error.
+        captures: their names.
 
     Returns:
         The smaller group compared with the rest, and the captures before the largest change with those after
@@ -273,8 +264,8 @@ def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, 
     sight = centres.mean(axis=0) / np.linalg.norm(centres.mean(axis=0))
     boards = _Turns(shares @ turns[0], 1 / (shares @ turns[1] ** 2), sight)
     # Captures of one placement have one error, but each may be an outlier.
-    captures = _Turns(turns[0], shares.sum(axis=0) / turns[1] ** 2, sight)
-    return boards.groups(groups), captures.change()
+    each = _Turns(turns[0], shares.sum(axis=0) / turns[1] ** 2, sight)
+    return boards.groups(groups, captures), each.change(captures)
 
 
 class _Turns(NamedTuple):
@@ -290,18 +281,18 @@ class _Turns(NamedTuple):
     weights: Array
     sight: Array
 
-    def groups(self, groups: Array) -> Contrast:
+    def groups(self, groups: Array, captures: Sequence[str]) -> Contrast:
         """Compare the smaller of the two groups (n, F) that differ most with the rest."""
         order, n = np.argsort(self.angles), len(self.angles)
         cut, fall = self._divide(order, max(_MIN_SHARE, int(np.ceil(_MIN_GROUP * n))))
         smaller, rest = sorted((order[:cut], order[cut:]), key=len)
         # A gamma distribution of that mean and variance.
         chance = chance_of(2 * _MEAN_GAIN * fall, 2 * _MEAN_GAIN**2 * n)
-        members = tuple(np.flatnonzero(groups[smaller].any(axis=0)).tolist())
+        members = _named(captures, groups[smaller].any(axis=0))
         apart, _ = self._compare(smaller, rest)
-        return Contrast("group", "rest", apart, chance, len(members), members, is_noise_known=True)
+        return Contrast("group", "rest", apart, chance, members, is_noise_known=True)
 
-    def change(self) -> Contrast:
+    def change(self, captures: Sequence[str]) -> Contrast:
         """Compare captures before and after the largest change."""
         order = np.arange(len(self.angles))
         cut, fall = self._divide(order, _MIN_END)
@@ -312,7 +303,7 @@ class _Turns(NamedTuple):
         n_tried = len(order) + 1 - 2 * _MIN_END
         chance = min(n_tried * chance_of(fall, 1), 1.0) if is_change else 1.0
         apart, _ = self._compare(order[:cut], order[cut:])
-        return Contrast("before", "after", apart, chance, cut, is_noise_known=True)
+        return _change(apart, chance, cut, captures, is_noise_known=True)
 
     def _divide(self, order: NDArray[np.intp], least: int) -> tuple[int, float]:
         """Divide boards in an order where the weighted sum of squares falls most.
@@ -400,22 +391,17 @@ def objections(
     sensor moved.
     """
     found = sorted((c for c in contrasts if c.excess(target, max_change) > 1), key=lambda each: each.chance)
-    by_place = min((each.chance for each in found if each.is_of_places), default=1.0)
-    found = [
-        each
-        for each in found
-        if each.rejected or not ((each.is_change and each.chance > by_place) or (each.group and by_place < 1))
-    ]
-    moved = [each for each in found if each.rejected]
-    changes = [each for each in found if each.is_change]
-    groups = [each for each in found if each.group and not changes]
+    by_place = min((each.chance for each in found if not each.captures), default=1.0)
+    moved = [each for each in found if each.is_rejected]
+    used = [each for each in found if each.captures and not each.is_rejected]
+    changes = [each for each in used if each.is_change and each.chance <= by_place]
+    groups = [each for each in used if each.is_group and by_place == 1 and not changes]
     told = [*(moved or changes)[:1], *groups[:1]]
-    return [each for each in contrasts if each in told or (each.is_of_places and each in found)]
+    return [each for each in contrasts if each in told or (each in found and not each.captures)]
 
 
 def split_findings(
     contrasts: Sequence[Contrast],
-    captures: Sequence[str],
     target: CalibrationSettings,
     of_cameras: str = "",
 ) -> list[Finding]:
@@ -423,7 +409,6 @@ def split_findings(
 
     Args:
         contrasts: see `contrast_halves`.
-        captures: names, in the order in which they were taken.
         target: standard deviations to reach.
         of_cameras: names of two cameras where their relative pose is compared, not extrinsics.
     """
@@ -431,28 +416,29 @@ def split_findings(
     max_change = _MAX_OF_CAMERAS if of_cameras else _MAX_CHANGE
     found = objections(contrasts, target, max_change)
     # Boards that contradict may be far, at the left and low: the places that differ most tell of them all.
-    of_places = [each for each in found if each.is_of_places]
+    of_places = [each for each in found if not each.captures]
     others = sorted(of_places, key=lambda each: each.excess(target))[:-1]
     for c in found:
         if c in others:
             continue
         severity = failing(c.excess(target, max_change) > _FAIL)
         rotation_deg, translation_m = tangent_sizes(c.apart)
-        apart: dict[str, Any] = {
-            "rotation_deg": rotation_deg,
-            "translation_m": translation_m,
-            "chance": c.chance,
-        }
-        if c.rejected is not None:
+        if c.captures:
             # Where the first captures were taken before a sensor moved, the result holds since.
-            severity = "warning" if c.rejected.place == "first" else severity
-            findings.append(MOVED(severity=severity, n_captures=c.n_first, **c.rejected._asdict(), **apart))
-        elif c.is_change:
-            kind = CAMERA_CHANGED if of_cameras else CHANGED
-            findings.append(kind(of_cameras, severity=severity, capture=captures[c.n_first], **apart))
-        elif c.group:
-            names = tuple(captures[k] for k in c.group)
-            findings.append(TWO_GROUPS(captures=names, n_captures=c.n_first, **apart))
+            is_rough = c.is_group or (c.is_rejected and c.place == "first")
+            findings.append(
+                MOVED(
+                    of_cameras,
+                    severity="warning" if is_rough else severity,
+                    captures=c.captures,
+                    n_captures=len(c.captures),
+                    place=c.place,
+                    neighbour=c.neighbour,
+                    rotation_deg=rotation_deg,
+                    translation_m=translation_m,
+                    chance=c.chance,
+                )
+            )
         elif not of_cameras:
             findings.append(
                 SHARES_DIFFER(
@@ -461,7 +447,9 @@ def split_findings(
                     first=c.first,
                     second=c.second,
                     others=tuple(f"{each.first} and {each.second}" for each in others[::-1]),
-                    **apart,
+                    rotation_deg=rotation_deg,
+                    translation_m=translation_m,
+                    chance=c.chance,
                 )
             )
     return findings

@@ -41,7 +41,6 @@ from lce_rig.judge.split_consistency import (
     LEAST_CHANCE,
     MEDIAN_CHI2,
     Contrast,
-    RejectedGroup,
     contrast_halves,
     find_groups,
     find_turned,
@@ -72,7 +71,6 @@ class Validation:
         cov_agreed: (6, 6) the same without what checks contradict.
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
-        captures: their names, in the order of the contrasts; of two LiDARs with outliers.
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
         pattern: as `pattern_of`, where it contradicts the profile; else None.
@@ -85,7 +83,6 @@ class Validation:
     cov_agreed: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
-    captures: tuple[str, ...]
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
     pattern: tuple[Array, Array] | None
@@ -143,13 +140,16 @@ def validate(
             settled = own_cost.weighted(recount).settled(own_cost.optimum())
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
-        contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
+        names = estimate.used
+        contrasts = (
+            *of_rejected,
+            *contrast_halves(settled, centres, names),
+            *find_groups(settled, names),
+        )
         if estimate.turns is not None and recount is None:
-            contrasts += find_turned(estimate.turns, centres, settled.groups)
+            contrasts += find_turned(estimate.turns, centres, settled.groups, names)
         # Captures of another mounting would look like other angles.
-        apart = {
-            name for each in objections(contrasts, rig.calibration) for name in each.minority(estimate.used)
-        }
+        apart = {name for each in objections(contrasts, rig.calibration) for name in each.captures}
         agreeing = [observation for observation in observations if observation.capture not in apart]
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
@@ -161,7 +161,6 @@ def validate(
         # Each session has fitted its own lens.
         cov_shared=summed_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
-        captures=estimate.used,
         contrasts=contrasts,
         scale=scale,
         pattern=pattern,
@@ -259,9 +258,8 @@ class _Test:
         chance = PoseDifference(apart, cov).chance
         # Where the last captures moved, the result holds no longer.
         words = ("before", "after") if place == "last" else ("group", "rest")
-        rejected = RejectedGroup(names, place, neighbour)
         gain = float(np.sum(self._costs(group, T_rest) - costs)) * len(names) / len(group)
-        return gain, Contrast(*words, apart, chance, len(names), rejected=rejected)
+        return gain, Contrast(*words, apart, chance, names, place, neighbour, is_rejected=True)
 
     def _fit(self, group: Sequence[Observation], T: Array, x: Array) -> tuple[Array, Array]:
         """Fit extrinsics to a group with the constants of the rest: costs (F,), and the extrinsics."""

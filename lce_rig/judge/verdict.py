@@ -15,7 +15,6 @@ from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
-    CHANGED,
     CHANNELS_DIFFER,
     EDGE_RESIDUAL,
     FAIL_FACTOR,
@@ -102,7 +101,7 @@ def judge(
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, board),
         *_pattern(examination.pattern, len(estimate.used)),
-        *split_findings(examination.contrasts, examination.captures, rig.calibration),
+        *split_findings(examination.contrasts, rig.calibration),
         *others,
         *_motion(estimate),
         *_channels(estimate, rig),
@@ -129,7 +128,7 @@ def _blame_lens(findings: Sequence[Finding], is_misfit: bool) -> list[Finding]:
     if not blamed:
         return list(findings)
     errors = {f.code for f in findings if f.severity == "error"}
-    of_motion = {MOVED.code, CHANGED.code} if is_misfit else set()
+    of_motion = {MOVED.code} if is_misfit else set()
     is_cause = bool(errors & of_motion) or (SHARES_DIFFER.code in errors and SCALE_OFF.code not in errors)
 
     def severity_of(f: Finding) -> Severity:

@@ -47,7 +47,7 @@ def test_a_move_is_named_with_its_dates_and_sizes(result):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"verdict": "fail", "findings": ("verdict.changed",), "severities": ("error",)},
+        {"verdict": "fail", "findings": ("verdict.moved",), "severities": ("error",)},
         {"status": "failed"},
         {"cov": None},
         {"date": None},

@@ -66,9 +66,9 @@ def test_sound_sessions_are_not_questioned(sound):
 @pytest.mark.parametrize("seed", range(2))
 def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge, figure, size):
     found = findings(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
-    (change,) = (finding for finding in found if finding.code == "verdict.camera_changed")
+    (change,) = (finding for finding in found if finding.code == "verdict.moved")
     assert change.subject.split(" to ") == [LEFT, RIGHT]
-    assert change.figures["capture"] == "000006"
+    assert (change.figures["place"], change.figures["neighbour"]) == ("last", "000005")
     assert change.figure(figure) == pytest.approx(size, rel=0.25)
 
 

@@ -19,6 +19,7 @@ from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 RIG = load_rig("rlfs")
 TARGET = CalibrationSettings()
 FAST = EstimateSettings("paper")
+LETTERS = "abcdefghijklmnop"
 # Any method's result lies about as far from the truth.
 T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
 
@@ -34,6 +35,18 @@ def observed(n=15, seed=1, scenario=None):
 def expanded(observations, T=T_NEAR, is_profile_free=False, laser=0.008, offset=0.005):
     every = expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
     return every if is_profile_free else every.hold(OF_PROFILE)
+
+
+def names_of(observations):
+    return tuple(seen.capture for seen in observations)
+
+
+def halves(observations):
+    return contrast_halves(expanded(observations).settled(), middles(observations), names_of(observations))
+
+
+def groups(observations):
+    return find_groups(expanded(observations).settled(), names_of(observations))
 
 
 def middles(observations):
@@ -94,30 +107,28 @@ def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severit
         moved(seen, nudge @ seen.image.T_cam_board) if k >= 12 else seen
         for k, seen in enumerate(observed(20, 4))
     ]
-    contrasts = contrast_halves(expanded(nudged).settled(), middles(nudged))
-    names = [seen.capture for seen in nudged]
-    findings = split_findings(contrasts[:1], names, TARGET)
+    contrasts = halves(nudged)
+    findings = split_findings(contrasts[:1], TARGET)
     assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
     if severity is not None:
-        assert abs(contrasts[0].n_first - 12) <= 1
+        assert abs(len(contrasts[0].captures) - 8) <= 1
         assert abs(tangent_sizes(contrasts[0].apart)[0] - angle_deg) < 0.3 * angle_deg
 
 
 @pytest.mark.parametrize(
-    ("turned", "cut"), [((13, 14), 13), ((0, 1), 2), ((14,), None)], ids=["last two", "first two", "last one"]
+    ("turned", "is_told"), [((13, 14), True), ((0, 1), True), ((14,), False)], ids=["last", "first", "one"]
 )
 def test_two_captures_at_an_end_that_agree_on_another_mounting_are_a_change_and_an_outlier_is_none(
-    turned, cut
+    turned, is_told
 ):
     turn = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.5), 0, 0]))
     boards = [
         moved(seen, turn @ seen.image.T_cam_board) if k in turned else seen
         for k, seen in enumerate(observed(15, 4))
     ]
-    found = contrast_halves(expanded(boards).settled(), middles(boards))
-    findings = split_findings(found[:1], [seen.capture for seen in boards], TARGET)
-    told = [(finding.severity, finding.figures["capture"]) for finding in findings]
-    assert told == ([] if cut is None else [("error", f"{cut:06d}")])
+    findings = split_findings(halves(boards)[:1], TARGET)
+    told = [(finding.severity, finding.figures["captures"]) for finding in findings]
+    assert told == ([("error", tuple(f"{k:06d}" for k in turned))] if is_told else [])
 
 
 def test_near_boards_that_say_something_else_than_far_ones_are_found():
@@ -128,8 +139,7 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
         moved(seen, turn @ seen.image.T_cam_board) if distance_m < np.median(distances_m) else seen
         for seen, distance_m in zip(boards, distances_m, strict=True)
     ]
-    found = contrast_halves(expanded(boards).settled(), middles(boards))
-    findings = split_findings(found, [seen.capture for seen in boards], TARGET)
+    findings = split_findings(halves(boards), TARGET)
     assert any(finding.figures.get("first") == "near" for finding in findings)
 
 
@@ -137,9 +147,7 @@ def test_boards_held_near_first_and_far_later_are_told_by_their_places_and_not_a
     turn = perturb(np.eye(4), np.array([0, 0, 0, 0, np.radians(1.0), 0]))
     boards = sorted(observed(24, 5), key=lambda seen: float(np.linalg.norm(seen.image.T_cam_board[:3, 3])))
     boards = [moved(seen, turn @ seen.image.T_cam_board) if k < 12 else seen for k, seen in enumerate(boards)]
-    settled = expanded(boards).settled()
-    contrasts = (*contrast_halves(settled, middles(boards)), *find_groups(settled))
-    findings = split_findings(contrasts, [seen.capture for seen in boards], TARGET)
+    findings = split_findings((*halves(boards), *groups(boards)), TARGET)
     assert {finding.code for finding in findings} == {"verdict.shares_differ"}
 
 
@@ -151,11 +159,10 @@ def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest(angle
         moved(seen, nudge @ seen.image.T_cam_board) if k in away else seen
         for k, seen in enumerate(observed(16, 4))
     ]
-    found = find_groups(expanded(nudged).settled())
-    (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET)
-    assert finding.code == "verdict.two_groups"
-    assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
-    assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in finding.text
+    (finding,) = split_findings(groups(nudged), TARGET)
+    assert (finding.code, finding.severity) == ("verdict.moved", "warning")
+    assert (finding.figures["captures"], finding.figures["place"]) == (tuple(f"{k:06d}" for k in away), "")
+    assert "5 captures (000001, 000004, 000005, 000009 ...) fit" in finding.text
     assert finding.figures["rotation_deg"] == pytest.approx(angle_deg, abs=0.3)
 
 
@@ -171,7 +178,7 @@ def test_a_sensor_that_turns_to_and_fro_about_the_line_of_sight_is_told_and_clai
         validation = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
         verdict, findings = judge(estimate, validation, RIG, "cam", "lidar", 16)
         assert verdict == ("pass" if all(f.severity == "note" for f in findings) else "marginal")
-        if any(f.code == "verdict.two_groups" for f in findings):
+        if any(f.code == "verdict.moved" for f in findings):
             told += 1
             off_rad = difference(estimate.T_cam_lidar, T_FORWARD)[5]
             assert abs(off_rad) < 3 * np.sqrt(validation.cov[5, 5])
@@ -181,21 +188,24 @@ def test_a_sensor_that_turns_to_and_fro_about_the_line_of_sight_is_told_and_clai
 def test_captures_of_one_placement_count_once_in_a_search_for_turns():
     angles = np.radians(np.tile([0.0, 0.4], 4))
     turns, centres = np.array([angles, np.full(8, np.radians(0.1))]), np.tile([0.0, 0.0, 3.0], (8, 1))
-    once, _ = find_turned(turns, centres, np.eye(8))
+    once, _ = find_turned(turns, centres, np.eye(8), "abcdefgh")
     twice, _ = find_turned(
-        np.repeat(turns, 2, axis=1), np.repeat(centres, 2, axis=0), np.repeat(np.eye(8), 2, axis=1)
+        np.repeat(turns, 2, axis=1),
+        np.repeat(centres, 2, axis=0),
+        np.repeat(np.eye(8), 2, axis=1),
+        "aabbccddeeffgghh",
     )
     assert once.chance < 0.001
     assert twice.chance == pytest.approx(once.chance)
-    assert once.group in ((0, 2, 4, 6), (1, 3, 5, 7))
-    assert len(twice.group) == 8
+    assert once.captures in (tuple("aceg"), tuple("bdfh"))
+    assert len(twice.captures) == 8
     assert tangent_sizes(once.apart)[0] == pytest.approx(0.4)
 
 
 def test_groups_and_changes_are_named_in_few_sessions_with_turns_of_the_noise_that_is_stated():
     rng = np.random.default_rng(1)
     found = [
-        find_turned(np.array([rng.standard_normal(16), np.ones(16)]), np.ones((16, 3)), np.eye(16))
+        find_turned(np.array([rng.standard_normal(16), np.ones(16)]), np.ones((16, 3)), np.eye(16), LETTERS)
         for _ in range(4000)
     ]
     groups, changes = np.array([[each.chance for each in both] for both in found]).T
@@ -207,15 +217,17 @@ def test_groups_and_changes_are_named_in_few_sessions_with_turns_of_the_noise_th
 
 
 @pytest.mark.parametrize(
-    ("turned", "cut"), [((14, 15), 14), ((0, 1), 2), ((9, 10, 11, 12, 13, 14, 15), 9), ((15,), None)]
+    ("turned", "fewer"),
+    [((14, 15), "op"), ((0, 1), "ab"), ((9, 10, 11, 12, 13, 14, 15), "jklmnop"), ((15,), "")],
 )
-def test_turns_tell_a_sensor_that_moved_at_a_capture_from_an_outlier(turned, cut):
+def test_turns_tell_a_sensor_that_moved_at_a_capture_from_an_outlier(turned, fewer):
     angles = np.radians(np.tile([0.05, -0.05], 8))
     angles[[*turned]] += np.radians(0.6)
     turns, centres = np.array([angles, np.full(16, np.radians(0.12))]), np.tile([0.0, 0.0, 3.0], (16, 1))
-    _, change = find_turned(turns, centres, np.eye(16))
-    assert (change.chance < 0.001, change.n_first) == ((True, cut) if cut else (False, change.n_first))
-    if cut:
+    _, change = find_turned(turns, centres, np.eye(16), LETTERS)
+    assert (change.chance < 0.001) == bool(fewer)
+    if fewer:
+        assert change.captures == tuple(fewer)
         assert tangent_sizes(change.apart)[0] == pytest.approx(0.6, abs=0.1)
 
 
@@ -229,7 +241,7 @@ def test_a_sensor_turned_about_the_line_of_sight_before_the_last_two_captures_do
     estimate = fit_extrinsic(boards, BOARD, EstimateSettings(method))
     validation = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
     verdict, findings = judge(estimate, validation, RIG, "cam", "lidar", 16)
-    assert (verdict, findings[0].code) == ("fail", "verdict.changed")
+    assert (verdict, findings[0].code) == ("fail", "verdict.moved")
     off_rad = difference(estimate.T_cam_lidar, turn @ T_FORWARD)[5]
     assert abs(off_rad) < 2 * np.sqrt(validation.cov[5, 5])
 
@@ -240,25 +252,20 @@ def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
         moved(seen, nudge @ seen.image.T_cam_board) if k >= 8 else seen
         for k, seen in enumerate(observed(16, 4))
     ]
-    settled = expanded(nudged).settled()
-    contrasts = (*contrast_halves(settled, middles(nudged)), *find_groups(settled))
+    contrasts = (*halves(nudged), *groups(nudged))
     assert contrasts[-1].excess(TARGET) > 1
-    codes = [each.code for each in split_findings(contrasts, [o.capture for o in nudged], TARGET)]
-    assert codes == ["verdict.changed"]
+    (finding,) = split_findings(contrasts, TARGET)
+    assert finding.figures["place"]
 
 
 def test_a_sound_session_has_no_groups_more_often_than_by_chance():
-    chances = [find_groups(expanded(observed(15, seed)).settled())[0].chance for seed in range(8)]
+    chances = [groups(observed(15, seed))[0].chance for seed in range(8)]
     assert min(chances) > 0.001
     assert np.median(chances) > 0.05
 
 
 def test_a_sound_session_shows_no_contrast_more_often_than_by_chance():
-    chances = [
-        contrast.chance
-        for seed in range(8)
-        for contrast in contrast_halves(expanded(observed(15, seed)).settled(), middles(observed(15, seed)))
-    ]
+    chances = [contrast.chance for seed in range(8) for contrast in halves(observed(15, seed))]
     assert np.mean(np.array(chances) < 0.001) == 0
     assert np.mean(np.array(chances) < 0.05) < 0.2
 

@@ -21,7 +21,7 @@ from lce_rig.judge.findings import (
     by_cause,
     consequences,
 )
-from lce_rig.judge.split_consistency import Contrast, RejectedGroup
+from lce_rig.judge.split_consistency import Contrast
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import distance_findings, judge, plate_findings
 from lce_rig.lens.models import LensPrior
@@ -228,11 +228,11 @@ def test_intrinsics_that_fit_few_images_come_before_captures_of_another_mounting
     estimate, n_misfits, first, moved
 ):
     turned = np.r_[np.zeros(3), np.radians(3.0), 0, 0]
-    rejected = RejectedGroup(("000018", "000019"), "last", "000017")
-    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1, is_visible=True)
-    examination = replace(
-        examined(estimate), contrasts=(Contrast("before", "after", turned, 0.0, 2, rejected=rejected),)
+    moved_apart = Contrast(
+        "before", "after", turned, 0.0, ("000018", "000019"), "last", "000017", is_rejected=True
     )
+    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1, is_visible=True)
+    examination = replace(examined(estimate), contrasts=(moved_apart,))
     verdict, findings = judge(estimate, examination, RIG, "cam", "lidar", 20, [lens], None, n_misfits)
     assert (verdict, findings[0].code) == ("fail", first)
     assert [f.severity for f in findings if f.code == "verdict.moved"] == [moved]
@@ -245,7 +245,7 @@ def test_intrinsics_that_boards_contradict_are_the_cause_of_boards_that_differ_b
 
     places = [("near", "far", 1.6), ("left", "right", 1.1), ("upper", "lower", 0.1)]
     contrasts = tuple(
-        Contrast(first, second, np.radians([0, 0, 0, deg, 0, 0]), 1e-9, 10) for first, second, deg in places
+        Contrast(first, second, np.radians([0, 0, 0, deg, 0, 0]), 1e-9) for first, second, deg in places
     )
     lens = INTRINSICS(
         severity="warning",

@@ -133,9 +133,9 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
     for own in found.values():
         assert own.verdict in ("marginal", "fail")
         assert own.estimated_with == ()
-        (change,) = (each for each in own.findings if each.code == "verdict.camera_changed")
+        (change,) = (each for each in own.findings if each.code == "verdict.moved" and each.subject)
         assert change.subject.split(" to ") == [LEFT, RIGHT]
-        assert change.figures["capture"] == "000006"
+        assert change.figures["captures"] == tuple(f"{k:06d}" for k in range(6, 12))
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(in_use(found[LEFT].T_cam_lidar, found[LEFT].intrinsics), TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25

@@ -119,7 +119,7 @@ def test_a_lidar_that_moved_between_captures_never_passes(n_moved, turn_deg):
     for seed in range(2):
         result = calibrate(rig, scan_both(16, seed, rig.board.to_board(), n_moved=n_moved, move=move))
         assert result.verdict != "pass"
-        assert codes(result) & {"verdict.moved", "verdict.changed", "verdict.two_groups"}
+        assert "verdict.moved" in codes(result)
 
 
 def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
