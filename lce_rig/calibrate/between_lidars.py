@@ -35,7 +35,7 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
-from lce_rig.calibrate.uncertainty import widen
+from lce_rig.calibrate.uncertainty import laser_angles, widen
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import (
@@ -75,11 +75,13 @@ class PlacedBoards:
         T: (F, 4, 4) T_lidar_board.
         cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
         shared: (F, 6, m) tangents by m independent errors of unit variance, common to all captures.
+        laser_angles: as of `CalibrationEstimate`.
     """
 
     T: Array
     cov: Array
     shared: Array
+    laser_angles: Mapping[str, float]
 
 
 class PairEstimate(NamedTuple):
@@ -159,7 +161,7 @@ def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateS
     values, vectors = np.linalg.eigh(np.einsum("fij,fik->jk", shared, shared))
     kept = vectors[:, values > _NEGLIGIBLE**2 * values[-1]]
     of_own = np.asarray(np.linalg.inv(reduced.of_own), dtype=np.float64)
-    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept))
+    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept), laser_angles(joint))
 
 
 def estimate_between_lidars(
@@ -200,7 +202,7 @@ def estimate_between_lidars(
     spins_rad = np.abs(np.einsum("fi,fi->f", apart[:, 3:], one.T[:, :3, 2]))
     T_view = optical_frame(one.T[:, :3, 3])
     R = np.kron(np.eye(2), T_view[:3, :3])
-    one = PlacedBoards(T_view @ one.T, R @ one.cov @ R.T, R @ one.shared)
+    one = replace(one, T=T_view @ one.T, cov=R @ one.cov @ R.T, shared=R @ one.shared)
     refused, observations = dict(consensus.refused), []
     for k, o in enumerate(agreed):
         if spins_rad[k] > _MOST_TURN_RAD:
@@ -224,7 +226,9 @@ def estimate_between_lidars(
         solved.diagnostics,
     )
     used = spins_rad <= _MOST_TURN_RAD
-    one, other = (PlacedBoards(each.T[used], each.cov[used], each.shared[used]) for each in (one, other))
+    one, other = (
+        replace(each, T=each.T[used], cov=each.cov[used], shared=each.shared[used]) for each in (one, other)
+    )
     estimate, trust = _fit_poses(start, one, other, board)
     return PairEstimate(estimate, trust, T_view)
 
@@ -338,4 +342,5 @@ def _fit_poses(
     left_out = jackknife_scatter(cost.moves()[:, :6])
     cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
     figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
-    return replace(report(start, T, cov, board, figures), method="ml", cost=cost), trust
+    estimate = report(start, T, cov, board, figures)
+    return replace(estimate, method="ml", cost=cost, laser_angles=other.laser_angles), trust

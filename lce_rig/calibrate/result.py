@@ -82,6 +82,7 @@ class CalibrationEstimate:
             cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
             its standard deviation at usual noise, both by the likelihood; None without it.
+        laser_angles: rms error of the lasers' azimuths and elevations, deg, as `uncertainty.laser_angles`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
@@ -101,6 +102,7 @@ class CalibrationEstimate:
     sensitivities: tuple[Sensitivity, ...] = ()
     cost: Quadratics | None = None
     turns: Array | None = None
+    laser_angles: Mapping[str, float] = field(default_factory=dict)
     lens: SessionLens | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

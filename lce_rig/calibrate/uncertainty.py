@@ -9,7 +9,7 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
-from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
+from lce_rig.calibrate.likelihood.layout import LASER, OWN, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
@@ -20,11 +20,13 @@ from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, re
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
-from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.geometry import Array, chance_of, invert, transform
 from lce_rig.core.results import Observation
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
+# Angles of lasers with a loose prior, and the chance below which they are not those of the scans.
+_LOOSE_RAD, _CHANCE = np.radians(1.0), 1e-4
 # Effects of the plate's size are linear: a step only keeps clear of rounding.
 _STEP_M = 1e-3
 
@@ -62,6 +64,7 @@ def by_scatter(
         fitted={observation.capture: observation for observation in start.fitted},
         sensitivities=sensitivities,
         turns=_turns(joint),
+        laser_angles=laser_angles(joint),
         lens=settings.lens,
     )
 
@@ -249,7 +252,8 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
     # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(own)) if n_cameras > 1 else np.zeros((6, 6))
     cost = replace(joint.cost.of(own), prior=prior, prior_gradient=np.zeros(len(own)))
-    return replace(estimate, method="ml", cost=cost, turns=_turns(joint, camera))
+    turns = _turns(joint, camera)
+    return replace(estimate, method="ml", cost=cost, turns=turns, laser_angles=laser_angles(joint))
 
 
 def with_profile(
@@ -283,6 +287,40 @@ def _turns(joint: JointEstimate, camera: int = 0) -> Array:
     sight = images.T_cam_board[:, :3, 3] / np.linalg.norm(images.T_cam_board[:, :3, 3], axis=1, keepdims=True)
     variance = np.einsum("fi,fij,fj->f", sight, cov[:, 3:, 3:], sight)
     return np.array([np.sum(sight * own, axis=1), np.sqrt(variance)])
+
+
+def laser_angles(joint: JointEstimate) -> dict[str, float]:
+    """Estimate how far the lasers' angles are from the scans', beyond their noise.
+
+    Another model or beam table turns rays by more than the likelihood's prior P allows, which holds angles x
+    near their mean m. To first order, a loose one P' in its place gives
+
+        x' = x - (H - P + P')^-1 (P' x - P (x - m))
+
+    with H the information of all unknowns at the optimum.
+
+    Returns:
+        Rms over rings of the errors about their mean in deg, by "azimuth" and "elevation": the noise is
+        subtracted, rings count by their information; 0 where noise alone explains them.
+    """
+    cost, z, layout = joint.cost, joint.state.z, joint.state.layout
+    of_angles = layout.lasers[1:].ravel()
+    information, gradient = cost.information.copy(), np.zeros(len(z))
+    information[of_angles[:, None], of_angles] -= cost.prior[of_angles[:, None], of_angles]
+    information[of_angles, of_angles] += _LOOSE_RAD**-2
+    gradient[of_angles] = z[of_angles] / _LOOSE_RAD**2 - cost.prior_gradient[of_angles]
+    cov = np.linalg.inv(information)
+    x = z - cov @ gradient
+    sizes = {}
+    for name, at in zip(LASER[1:], layout.lasers[1:], strict=True):
+        own = cov[at[:, None], at]
+        weights = 1 / np.diag(own)
+        about_mean = np.eye(len(at)) - weights / weights.sum()
+        errors, variances = about_mean @ x[at], np.diag(about_mean @ own @ about_mean.T)
+        is_sure = chance_of(float(x[at] @ np.linalg.solve(own, x[at])), len(at)) < _CHANCE
+        excess = np.average((errors**2 - variances), weights=variances**-2.0) if is_sure else 0.0
+        sizes[name] = float(np.degrees(np.sqrt(max(excess, 0.0))))
+    return sizes
 
 
 def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:

@@ -6,7 +6,7 @@ disagree by 1.1 and 1.2 deg (acfr_vlp16, os1_64) are not found; acfr_vlp16, 1.0 
 reference, would be reported to 0.22 deg and 10 mm instead of 0.59 deg and 24 mm.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,6 @@ from lce_rig.judge.local_quadratic import (
     OF_PROFILE,
     SCALE,
     capture_costs,
-    estimate_angles,
     expand,
     feature_sigmas,
     pattern_of,
@@ -44,7 +43,6 @@ from lce_rig.judge.split_consistency import (
     contrast_halves,
     find_groups,
     find_turned,
-    objections,
 )
 from lce_rig.rig import LidarSettings, Rig
 
@@ -74,7 +72,6 @@ class Validation:
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
         pattern: as `pattern_of`, where it contradicts the profile; else None.
-        laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
         lens_model: the finding that the profile's does not fit the corners.
     """
@@ -86,7 +83,6 @@ class Validation:
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
     pattern: tuple[Array, Array] | None
-    laser_angles: Mapping[str, float]
     intrinsics: IntrinsicsCheck | None
     lens_model: Sequence[Finding]
 
@@ -116,7 +112,6 @@ def validate(
     intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)
     scale = pattern = None
     contrasts: tuple[Contrast, ...] = ()
-    laser_angles: Mapping[str, float] = {}
     observations = [estimate.fitted[name] for name in estimate.used]
     expansion = expand(
         observations,
@@ -148,11 +143,6 @@ def validate(
         )
         if estimate.turns is not None and recount is None:
             contrasts += find_turned(estimate.turns, centres, settled.groups, names)
-        # Captures of another mounting would look like other angles.
-        apart = {name for each in objections(contrasts, rig.calibration) for name in each.captures}
-        agreeing = [observation for observation in observations if observation.capture not in apart]
-        if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
-            laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, scale, pattern, contrasts, rig))
     cov_agreed = estimate.cov + summed_covariance(known)
     return Validation(
@@ -164,7 +154,6 @@ def validate(
         contrasts=contrasts,
         scale=scale,
         pattern=pattern,
-        laser_angles=laser_angles,
         intrinsics=intrinsics,
         lens_model=[] if fitted is None or lens is None else model_findings(fitted, board),
     )
