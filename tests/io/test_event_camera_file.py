@@ -60,7 +60,9 @@ def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(t
 
 def test_frames_out_of_order_are_left_out_and_counted(tmp_path, rles):
     path = write_davis(
-        tmp_path / "a.aedat4", PIECES, [FRAMES[0], replace(FRAMES[1], exposure_us=-90_000), FRAMES[2]]
+        tmp_path / "a.aedat4",
+        PIECES,
+        [FRAMES[0], replace(FRAMES[1], exposure_us=-90_000, style="dv"), FRAMES[2]],
     )
     recording = opened(path, rles)
     assert len(images_of(recording)) == 2

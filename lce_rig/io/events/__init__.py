@@ -8,7 +8,7 @@ from pkgutil import resolve_name
 from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
-from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
+from lce_rig.io.events.aedat4 import Aedat4File
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError
 from lce_rig.io.findings import worded
 from lce_rig.io.recording import SourceOptions, choose_event_camera, fingerprint, follows, merge_by_time
@@ -120,10 +120,10 @@ class EventCameraFile:
 
     def _open_frames(self, file: Aedat4File) -> tuple[Aedat4File, int, str] | None:
         """Find the frames of an AEDAT4 file, the number of their stream and their channel; None without."""
-        number = file.first_stream("FRME")
+        number = file.first_stream("frame")
         if number is None:
             return None
-        first = next(file.packets(number, Losses(), decode_frame), None)
+        first = next(file.frames(number, Losses()), None)
         if first is None:
             return None
         channel = self._rig.cameras[self._camera].first_channel("frames")
@@ -132,7 +132,7 @@ class EventCameraFile:
             self.notes.append(f"{self.path.name}: {note}")
             return None
         self.streams.add(Stream(self._camera, channel, "images"))
-        self.n_samples = len(file.places[number])
+        self.n_samples = sum(1 for _ in file.packets(number, Losses()))
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:
             exposure_ms = first.exposure_ns * 1e-6
@@ -142,7 +142,7 @@ class EventCameraFile:
 
     def _images(self, file: Aedat4File, number: int, channel: str, losses: Losses) -> Iterator[Sample]:
         last_ns: int | None = None
-        for frame in file.packets(number, losses, decode_frame):
+        for frame in file.frames(number, losses):
             if follows(frame.mid_exposure_ns, last_ns, losses):
                 last_ns = frame.mid_exposure_ns
                 yield Image(self._camera, channel, last_ns, frame.pixels)

@@ -3,7 +3,6 @@
 import struct
 from dataclasses import dataclass
 
-import lz4.frame
 import numpy as np
 
 Value = tuple[str, int] | bytes
@@ -85,14 +84,12 @@ def frame_packet(frame):
             4: ("q", end_us),
             11: ("q", frame.exposure_us),
         }
-    elif frame.style == "exposure only":
-        fields |= {0: ("q", frame.start_us), 11: ("q", frame.exposure_us)}
     else:
         fields |= {0: ("q", frame.start_us)}
     return flatbuffer(b"FRME", fields)
 
 
-def write_davis(path, events, frames, resolution_px=(346, 260), camera="DAVIS346_0", pack=bytes):
+def write_davis(path, events, frames, resolution_px=(346, 260), camera="DAVIS346_0"):
     """Write a file whose recorder was not closed: packets by time of their first stamp."""
     width, height = resolution_px
     kinds = (["EVTS"] if events or not frames else []) + (["FRME"] if frames else [])
@@ -106,8 +103,7 @@ def write_davis(path, events, frames, resolution_px=(346, 260), camera="DAVIS346
     with path.open("wb") as file:
         file.write(b"#!AER-DAT4.0\r\n" + header)
         for _, number, data in sorted(packets, key=lambda packet: packet[:2]):
-            packed = pack(data)
-            file.write(struct.pack("<ii", number, len(packed)) + packed)
+            file.write(struct.pack("<ii", number, len(data)) + data)
     return path
 
 
@@ -116,4 +112,4 @@ def write_aedat4(path, stretches, camera="lce_rig"):
     parts = list(stretches)
     packets = [part.select(slice(k, k + 8192)) for part in parts for k in range(0, len(part), 8192)]
     size = (parts[0].width_px, parts[0].height_px) if parts else (346, 260)
-    write_davis(path, packets, [], size, camera, lz4.frame.compress)
+    write_davis(path, packets, [], size, camera)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.findings import Losses
-from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
-from tests.io.events.aedat4_files import RawFrame, flatbuffer, write_davis
+from lce_rig.io.events.aedat4 import Aedat4File
+from tests.io.events.aedat4_files import RawFrame, write_davis
 from tests.io.events.encoders import random_events
 
 START_US = 1_700_000_000_000_000
@@ -19,12 +19,12 @@ COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
 
 def read(path, losses=None):
     file = Aedat4File(path)
-    number = file.first_stream("FRME")
+    number = file.first_stream("frame")
     assert number is not None
-    return list(file.packets(number, losses or Losses(), decode_frame))
+    return list(file.frames(number, losses or Losses()))
 
 
-@pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
+@pytest.mark.parametrize("style", ["dv", "dv-processing"])
 def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(tmp_path, style):
     frames = [RawFrame(START_US + 40_000 * k, 8001, GREY, style) for k in range(3)]
     found = read(write_davis(tmp_path / "a.aedat4", [random_events(500, 1, start_us=START_US)], frames))
@@ -75,13 +75,6 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path):
     losses = Losses()
     assert [f.mid_exposure_ns for f in read(path, losses)] == [(START_US + 4000) * 1000]
     assert losses.by_code() == {"recording.broken_packets": 1, "recording.torn_end": 1}
-
-
-@pytest.mark.parametrize("n_bytes", [0, 99, 101])
-def test_a_frame_whose_size_contradicts_its_pixels_is_refused(n_bytes):
-    table = flatbuffer(b"FRME", {0: ("q", START_US), 6: ("h", 10), 7: ("h", 10), 10: bytes(n_bytes)})
-    with pytest.raises(ValueError):
-        decode_frame(table[4:])
 
 
 @pytest.mark.dataset
