@@ -1,6 +1,5 @@
 """Files of samples: exact there and back; damaged ones say what is wrong with them."""
 
-import io
 import struct
 from contextlib import suppress
 
@@ -92,34 +91,6 @@ def test_events_come_back_to_the_nanosecond(t_ns, host_ns):
         assert getattr(read, name).dtype == getattr(events, name).dtype
         assert np.array_equal(getattr(read, name), getattr(events, name))
     assert (read.sensor, read.width_px, read.height_px, read.host_ns) == ("cam", 346, 260, host_ns)
-
-
-@pytest.mark.parametrize(
-    "columns",
-    [
-        {},
-        {"t_us": [1], "x": [1]},
-        {"t_us": [1, 2], "x": [1], "y": [1]},
-        {"t_us": [1 << 60], "x": [1], "y": [1]},
-        {"t_us": [1], "x": [-1], "y": [1]},
-        {"t_us": [1], "x": [1 << 16], "y": [1]},
-        {"t_us": [0.5], "x": [1], "y": [1]},
-        {"t_us": [1], "x": 1, "y": [1]},
-        {"t_us": np.array([None], object), "x": [1], "y": [1]},
-    ],
-)
-def test_other_archives_are_refused(columns):
-    buffer = io.BytesIO()
-    np.savez(buffer, **columns, polarity=[True], resolution_px=[346, 260])
-    with pytest.raises(ValueError):
-        decode_events(buffer.getvalue(), "cam")
-
-
-@given(data=damaged(encode_events(events_at(list(range(0, 10**6, 10_000))))))
-def test_damaged_archives_give_events_or_an_error_that_names_the_file(data):
-    with suppress(SourceError), reading("capture/events.npz"):
-        events = decode_events(data, "cam")
-        assert len(events.t_ns) == len(events.x) == len(events.y) == len(events.polarity)
 
 
 @pytest.mark.parametrize("data", [b"[" * 100_000, b"[NaN]", b"[-Infinity]", b"\xff[1]", b'["\\ud800"]', b""])
