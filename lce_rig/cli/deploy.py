@@ -14,8 +14,8 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.fleet import deployment
 from lce_rig.fleet.deployment import Deployed, Plan
 from lce_rig.fleet.releases import ReleaseRecord, TargetState, differences_in_words, find_target
+from lce_rig.fleet.target import TargetSettings
 from lce_rig.pipeline.result_files import result_folder
-from lce_rig.rig.target_settings import TargetSettings
 
 
 @click.command()
@@ -24,7 +24,7 @@ from lce_rig.rig.target_settings import TargetSettings
 @path_option(
     "--targets",
     "FILE",
-    "Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
+    "Read targets from this file [default: deploy.yaml beside SESSION].",
 )
 @result_option("Deploy")
 @click.option("--robot", metavar="NAME", help="Name the robot, for a target that stands for many.")
@@ -71,18 +71,14 @@ def deploy(
     again = show.command("deploy", session, f" --target {shlex.quote(target_name)}")
     again += "" if targets is None else f" --targets {shlex.quote(str(targets))}"
     again += "" if robot is None else f" --robot {shlex.quote(robot)}"
+    target = find_target(target_name, targets, session, robot)
     if status or rollback:
-        # A session is opened for its profile only.
-        is_read = targets is None and (session / "session.json").exists()
-        rig = lce.Session.open(session).rig if is_read else None
-        target = find_target(target_name, targets, session, rig, robot)
         if status:
             _show_standing(deployment.standing(target), target, as_json=as_json)
         else:
             _show_done(deployment.rollback(target, release, reason=reason), target, again, as_json=as_json)
         return
     opened = lce.Session.open(session)
-    target = find_target(target_name, targets, session, opened.rig, robot)
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)

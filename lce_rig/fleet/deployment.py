@@ -51,9 +51,9 @@ from lce_rig.fleet.releases import (
     read_state,
     user_name,
 )
+from lce_rig.fleet.target import TargetSettings
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
-from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 
 _OTHER = "Another deployment came first. Run the same command again."

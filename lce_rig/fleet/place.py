@@ -28,7 +28,7 @@ from threading import Thread
 from typing import IO, NamedTuple
 
 from lce_rig.core.errors import TargetError
-from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.fleet.target import TargetSettings
 
 UNWRITABLE, NOT_OURS, LOCKED, CHANGED, NO_RELEASE = 73, 74, 75, 76, 77
 """Exit codes of the scripts."""

@@ -16,17 +16,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lce_rig.core.calibration import MADE_BY, ResultFile
 from lce_rig.core.errors import TargetError, UsageError
 from lce_rig.fleet.place import RECORD, SAYS, STATE, USED, Place
-from lce_rig.rig import Rig
+from lce_rig.fleet.target import ROBOT_FIELD, TargetSettings
 from lce_rig.rig.loading import explain, read_document, read_profile
-from lce_rig.rig.settings import RobotName, Settings
-from lce_rig.rig.target_settings import ROBOT_FIELD, TargetSettings
+from lce_rig.rig.settings import RobotName
 
 TARGETS_FILE = "deploy.yaml"
 _COMPACT = "%Y%m%dT%H%M%SZ"
 
 
-class _TargetsFile(Settings):
-    # A rig's profile can be given, too: only its targets are read.
+class _TargetsFile(BaseModel):
+    # Those of a rig's profile of an earlier version are read, too.
     model_config = ConfigDict(extra="ignore")
     targets: Annotated[dict[RobotName, TargetSettings], Field(min_length=1)]
 
@@ -41,34 +40,25 @@ def read_targets(path: Path) -> dict[str, TargetSettings]:
     try:
         content = _TargetsFile.model_validate(document.data)
     except ValidationError as error:
-        raise explain(error, document) from error
+        raise explain(error, document, _TargetsFile) from error
     return {name: target.located(path.parent) for name, target in content.targets.items()}
 
 
-def find_target(
-    name: str, file: Path | None, session: Path | None, rig: Rig | None, robot: str | None = None
-) -> TargetSettings:
-    """Find a target: in the file if one is given, else beside the session, else in its profile.
+def find_target(name: str, file: Path | None, session: Path, robot: str | None = None) -> TargetSettings:
+    """Find a target in a file.
 
     Args:
         name: of the target.
-        file: that lists targets.
-        session: its folder; deploy.yaml is looked for in its parent.
-        rig: the session's profile.
+        file: that lists targets; None for deploy.yaml beside the session.
+        session: its folder.
         robot: for a target that stands for many.
 
     Raises:
-        ProfileError: a file is invalid.
+        ProfileError: the file is invalid.
         UsageError: there is no target of this name, or it stands for many robots.
     """
-    targets: dict[str, TargetSettings] = {}
-    beside = None if session is None else session.resolve().parent / TARGETS_FILE
-    if file is not None:
-        targets = read_targets(file)
-    else:
-        targets |= {} if rig is None else rig.targets
-        if beside is not None and beside.is_file():
-            targets |= read_targets(beside)
+    place = file or session.resolve().parent / TARGETS_FILE
+    targets = read_targets(place) if file is not None or place.is_file() else {}
     target = targets.get(name)
     if target is not None and ROBOT_FIELD in target.to:
         with suppress(ValueError):
@@ -76,10 +66,7 @@ def find_target(
         raise UsageError(f"target {name!r} stands for many robots", "Add --robot NAME.")
     if target is not None:
         return target
-    where = file or beside or TARGETS_FILE
-    hint = (
-        f"Known targets: {', '.join(targets)}." if targets else f"List targets in {where}, or in the profile."
-    )
+    hint = f"Known targets: {', '.join(targets)}." if targets else f"List targets in {place}."
     raise UsageError(f"no target is called {name!r}", hint)
 
 

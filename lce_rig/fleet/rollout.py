@@ -18,8 +18,8 @@ from lce_rig.fleet import deployment
 from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.releases import read_targets
+from lce_rig.fleet.target import TargetSettings
 from lce_rig.rig import load_rig
-from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session.session import PROFILE
 
 State: TypeAlias = Literal["waiting", "in_place", "left_out", "failed"]

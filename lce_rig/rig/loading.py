@@ -72,7 +72,7 @@ def find_profile(name_or_path: str | Path) -> Path:
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
-    """Load the profile of a rig; paths in it become absolute.
+    """Load the profile of a rig.
 
     Args:
         name_or_path: name of a shipped profile ("rlfs") or path of a YAML file.
@@ -81,7 +81,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         ProfileError: no such profile, or an invalid one; every problem with file, line and key.
     """
     path = find_profile(name_or_path)
-    return parse_rig(read_profile(path), str(path)).located(path.parent)
+    return parse_rig(read_profile(path), str(path))
 
 
 def read_profile(path: Path) -> str:
@@ -239,11 +239,11 @@ def board_of(values: Mapping[str, Any], source: str) -> Board:
         raise explain(error, Document(source, {}, root=None)) from error
 
 
-def explain(error: ValidationError, document: Document) -> ProfileError:
+def explain(error: ValidationError, document: Document, schema: type[BaseModel] = Rig) -> ProfileError:
     """Build the error for the user, with each problem once, in the order of the file's lines."""
     problems: dict[KeyPath, tuple[str, KeyPath | None]] = {}
     for detail in error.errors():
-        path, what, meant = _problem(detail)
+        path, what, meant = _problem(detail, schema)
         problems.setdefault(path, (what, meant))
     # A misspelt key is not reported as missing as well.
     all_meant = {meant for _, meant in problems.values()}
@@ -259,14 +259,14 @@ def explain(error: ValidationError, document: Document) -> ProfileError:
     return ProfileError(f"{source}: {len(sentences)} problems", "\n".join(sentences))
 
 
-def _problem(detail: ErrorDetails) -> tuple[KeyPath, str, KeyPath | None]:
+def _problem(detail: ErrorDetails, schema: type[BaseModel]) -> tuple[KeyPath, str, KeyPath | None]:
     """Give a problem's key, its words, and the valid key that an unknown one probably stands for."""
     path = tuple(part for part in detail["loc"] if part != "[key]")
     kind, context = detail["type"], detail.get("ctx", {})
     # Bounded: repr() would write nested aliases out.
     value = "nothing" if detail["input"] is None else reprlib.repr(detail["input"])
     if kind == "extra_forbidden":
-        return path, *_unknown_key(path)
+        return path, *_unknown_key(path, schema)
     if kind == "missing" and isinstance(path[-1], int):
         return path[:-1], f"{value} has too few values", None
     if kind == "missing":
@@ -285,9 +285,9 @@ def _problem(detail: ErrorDetails) -> tuple[KeyPath, str, KeyPath | None]:
     return path, f"{what}; {value} given", None
 
 
-def _unknown_key(path: KeyPath) -> tuple[str, KeyPath | None]:
+def _unknown_key(path: KeyPath, schema: type[BaseModel]) -> tuple[str, KeyPath | None]:
     key, place = str(path[-1]), [str(part) for part in path[:-1]]
-    blocks = [(block.split(".") if block else [], name) for block, name in all_keys()]
+    blocks = [(block.split(".") if block else [], name) for block, name in all_keys(schema)]
     valid = [
         name
         for block, name in blocks
@@ -295,7 +295,7 @@ def _unknown_key(path: KeyPath) -> tuple[str, KeyPath | None]:
     ]
     # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
     nearest = [name for name in valid if name.startswith(f"{key}_")]
-    elsewhere = [block for block, name in all_keys() if name == key]
+    elsewhere = [block for block, name in all_keys(schema) if name == key]
     if elsewhere and not nearest:
         return f"unknown key here; move it to {elsewhere[0] or 'the top level'}", None
     nearest = nearest or difflib.get_close_matches(key, valid, n=1)

@@ -1,7 +1,6 @@
 """The profile of a rig: start reading the schema here."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -31,10 +30,25 @@ from lce_rig.rig.settings import (
     problem,
     require,
 )
-from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
 
-_MOST_SENSORS, _MOST_TARGETS = 64, 256
+_MOST_SENSORS = 64
+OutputFormat = Literal[
+    "extrinsics",
+    "urdf",
+    "camera_info",
+    "static_tf",
+    "ros2_launch",
+    "tf_static_bag",
+    "kalibr",
+    "autoware",
+    "fast_livo2",
+    "koide3",
+    "opencv",
+    "isaac",
+    "mcap",
+    "ply",
+]
 
 SWAPPED_SIDES = Kind(
     "profile.swapped_sides",
@@ -219,7 +233,6 @@ class Rig(Settings):
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name; none where LiDARs are calibrated with each other alone.
         nominal_extrinsics: the CAD model's values, a sanity check only.
-        targets: where `lce-rig deploy` writes results, by name.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
 
@@ -237,9 +250,6 @@ class Rig(Settings):
     )
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
     sync: SyncSettings | None = None
-    targets: Annotated[dict[RobotName, TargetSettings], Field(max_length=_MOST_TARGETS)] = Field(
-        default_factory=dict
-    )
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
 
@@ -337,11 +347,6 @@ class Rig(Settings):
         for name, camera in self.cameras.items():
             yield f"cameras.{name}.frame", camera.frame
             yield f"cameras.{name}.optical_frame", camera.optical_frame
-
-    def located(self, folder: Path) -> "Rig":
-        """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
-        targets = {name: target.located(folder) for name, target in self.targets.items()}
-        return self.model_copy(update={"targets": targets})
 
     def warnings(self) -> Iterator[Finding]:
         """List valid but probably unintended settings; the subject is the key."""

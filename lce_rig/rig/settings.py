@@ -12,7 +12,7 @@ _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 
 # Keys of earlier versions: profiles that state them are read, and nothing depends on them.
-_RETIRED = {"azimuth_offset_sigma_deg", "reconstruction", "verdict"}
+_RETIRED = {"azimuth_offset_sigma_deg", "reconstruction", "targets", "verdict"}
 
 # The meaning of each pattern, for errors.
 PATTERNS = {

@@ -12,7 +12,7 @@ from lce_rig.rig import Rig
 
 FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
-    r"description|nominal_extrinsics|exports|targets\..*|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
+    r"description|nominal_extrinsics|exports|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
 ).fullmatch
 # Known later than the first capture, perhaps; another one is another rig.
 _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
@@ -82,7 +82,7 @@ class DifferingKey(NamedTuple):
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
-    The description, the nominal extrinsics, targets of `deploy` and the addresses of attached sensors may
+    The description, the nominal extrinsics, and the addresses of attached sensors may
     differ, as no capture depends on them. The robot and serial numbers may be absent in either.
     """
     a, b = (_flatten(rig.model_dump(mode="json", exclude_none=True)) for rig in (theirs, ours))

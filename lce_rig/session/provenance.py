@@ -98,9 +98,7 @@ def content_sha256(session: Session) -> str:
 
 def _profile(rig: Rig) -> dict[str, Any]:
     """List what a result depends on in a profile."""
-    profile = rig.model_dump(
-        mode="json", exclude_defaults=True, exclude={"description", "robot", "targets", "exports"}
-    )
+    profile = rig.model_dump(mode="json", exclude_defaults=True, exclude={"description", "robot", "exports"})
     for kind in ("lidars", "cameras"):
         for sensor in profile.get(kind, {}).values():
             sensor.pop("driver", None)

@@ -12,8 +12,8 @@ import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored res
 from lce_rig.core.calibration import Provenance
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.target import TargetSettings
 from lce_rig.rig import load_rig
-from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.simulate import simulate_captures
 from tests.export.conftest import calibration, some_pose

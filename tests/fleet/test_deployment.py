@@ -13,7 +13,7 @@ from lce_rig.core.errors import CommandError, ResultRefusedError, TargetError
 from lce_rig.fleet.deployment import deploy, plan, rollback, standing
 from lce_rig.fleet.place import RECORD, Place
 from lce_rig.fleet.releases import content_of, set_sha256
-from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.fleet.target import TargetSettings
 from tests.fleet.conftest import ORIGIN, log_of
 
 Result = Callable[..., Path]

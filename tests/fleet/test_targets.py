@@ -8,8 +8,7 @@ from lce_rig.core.errors import ProfileError, TargetError, UsageError
 from lce_rig.fleet.deployment import standing
 from lce_rig.fleet.place import Place
 from lce_rig.fleet.releases import find_target, read_targets
-from lce_rig.rig import load_rig
-from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.fleet.target import TargetSettings
 
 
 def write(path, text):
@@ -17,19 +16,19 @@ def write(path, text):
     return path
 
 
-def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_path):
+def test_a_target_is_found_in_the_file_beside_the_session_or_the_one_given(tmp_path):
     session = tmp_path / "session"
     session.mkdir()
-    rig = load_rig("rles").model_copy(update={"targets": {"heron": TargetSettings(to="/profile")}})
-    assert find_target("heron", None, session, rig).to == "/profile"
+    with pytest.raises(UsageError):
+        find_target("heron", None, session)
     write(tmp_path / "deploy.yaml", "targets: {heron: {to: calib}, kestrel: {to: 'robot@kestrel:calib'}}")
     # A relative folder is one beside the file that names it.
-    assert find_target("heron", None, session, rig).to == str(tmp_path / "calib")
-    assert find_target("kestrel", None, session, None).host == "robot@kestrel"
+    assert find_target("heron", None, session).to == str(tmp_path / "calib")
+    assert find_target("kestrel", None, session).host == "robot@kestrel"
     other = write(tmp_path / "other.yaml", "targets: {kestrel: {to: /other}}")
-    assert find_target("kestrel", other, session, rig).to == "/other"
+    assert find_target("kestrel", other, session).to == "/other"
     with pytest.raises(UsageError) as caught:
-        find_target("heron", other, session, rig)
+        find_target("heron", other, session)
     assert "kestrel" in caught.value.hint
 
 
@@ -107,4 +106,4 @@ def test_the_name_of_a_robot_is_put_into_the_place_only(tmp_path):
         with pytest.raises(ValueError):
             target.for_robot(name)
     with pytest.raises(UsageError):
-        find_target("nav", tmp_path / "deploy.yaml", None, None)
+        find_target("nav", tmp_path / "deploy.yaml", tmp_path)

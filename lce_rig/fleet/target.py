@@ -1,4 +1,4 @@
-"""Where results are deployed to: the block `targets` of a profile or of a deploy.yaml."""
+"""Where results are deployed to: the block `targets` of a deploy.yaml."""
 
 import re
 from pathlib import Path
@@ -6,24 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from lce_rig.rig.profile import OutputFormat
 from lce_rig.rig.settings import RobotName, Settings, Text, problem
 
-OutputFormat = Literal[
-    "extrinsics",
-    "urdf",
-    "camera_info",
-    "static_tf",
-    "ros2_launch",
-    "tf_static_bag",
-    "kalibr",
-    "autoware",
-    "fast_livo2",
-    "koide3",
-    "opencv",
-    "isaac",
-    "mcap",
-    "ply",
-]
 # Options that make ssh run a program on this computer are not among them.
 SshOption = Literal[
     "AddressFamily",
