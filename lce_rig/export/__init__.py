@@ -13,8 +13,7 @@ import numpy as np
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, require_known
+from lce_rig.export.robot_tree import RobotTree, build_trees, require_known
 from lce_rig.export.writing import yaml_text
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -30,7 +29,7 @@ NO_FRAME = Kind(
     "export.no_frame",
     "{format}: {file} is not written: it needs the frame {frame} (profile: mount), and the root is {root}",
     "`lce-rig export {session} --formats {format} --tree URDF -o FOLDER`",
-    severity="warning",
+    severity="note",
 )
 NO_SESSION = Kind(
     "export.no_session",
@@ -42,12 +41,6 @@ NO_IMAGES = Kind(
     "export.no_images",
     "{format}: camera {subject} is left out: the session has no images of it",
     severity="warning",
-)
-MOUNT_UNUSED = Kind(
-    "export.mount_unused",
-    "the profile's mount is not used: {source} has {frame} elsewhere, {angle_deg:deg} and "
-    "{distance_m:1mm} off",
-    severity="note",
 )
 
 
@@ -77,7 +70,7 @@ class ExportJob:
         return [c for c in self.calibrations if not c.is_of_lidars]
 
     @cached_property
-    def trees(self) -> list[FrameTree]:
+    def trees(self) -> list[RobotTree]:
         """The trees of frames in which outputs place the sensors."""
         return build_trees(self.calibrations, self.rig, self.robot)
 
@@ -182,7 +175,6 @@ EXPORTS: dict[str, Format] = {
     ),
     "koide3": Format("other_tools:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"),
     "opencv": Format("other_tools:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
-    "isaac": Format("urdf:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"),
     "mcap": Format(
         "ros_bag:export_mcap", "RIG_session/: the session for Foxglove and RViz, with projected clouds"
     ),
@@ -253,12 +245,6 @@ def export(
     require_usable(calibrations, is_forced=is_forced)
     told = [] if findings is None else findings
     job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session, told)
-    if rig.mount is not None and robot is not None and rig.mount.of in robot.above:
-        joint = robot.above[rig.mount.of]
-        angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
-        if joint.parent == rig.mount.parent and (angle_deg >= 1e-4 or distance_m >= 1e-6):
-            figures = {"angle_deg": angle_deg, "distance_m": distance_m}
-            job.findings.append(MOUNT_UNUSED(source=robot.source, frame=rig.mount.of, **figures))
     paths: list[Path] = []
     try:
         for exporter in exporters:

@@ -28,7 +28,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.phrasing import significant
 from lce_rig.export import LENS_FITTED, NO_FRAME, ExportJob
-from lce_rig.export.robot_tree import FrameTree, RobotTree
+from lce_rig.export.robot_tree import RobotTree
 from lce_rig.export.writing import quaternion_xyzw, rpy
 from lce_rig.lens.models import MODELS, convert, grid_rays
 
@@ -237,32 +237,31 @@ def export_autoware(job: ExportJob) -> list[Path]:
     """
     paths = []
     for index, tree in enumerate(job.trees):
-        robot = RobotTree.of_joints("the tree", tree.joints)
-        entries = _entries(tree, robot, job)
+        entries = _entries(tree, job)
         if KIT in tree.frames:
-            T_root_kit = robot.find_pose(tree.root, KIT)
+            T_root_kit = tree.find_pose(tree.root, KIT)
         else:
-            first = min(entries, key=lambda entry: len(robot.chain(entry.frame)))
-            T_root_kit = robot.find_pose(tree.root, first.frame) @ invert(first.T_key_frame)
+            first = min(entries, key=lambda entry: len(tree.chain(entry.frame)))
+            T_root_kit = tree.find_pose(tree.root, first.frame) @ invert(first.T_key_frame)
         T_kit_root = invert(T_root_kit)
         poses = {
-            entry.key: T_kit_root @ robot.find_pose(tree.root, entry.frame) @ invert(entry.T_key_frame)
+            entry.key: T_kit_root @ tree.find_pose(tree.root, entry.frame) @ invert(entry.T_key_frame)
             for entry in entries
         }
         suffix = f"-{tree.root.replace('/', '_')}" if index else ""
         name = KIT_FILE.replace(".yaml", f"{suffix}.yaml")
         paths.append(_write_poses(job, name, "Autoware sensor kit calibration", {KIT: poses}, entries))
-        if tree.root == BASE or BASE in tree.frames:
-            T_base_kit = invert(robot.find_pose(tree.root, BASE)) @ T_root_kit
+        if BASE in tree.frames:
+            T_base_kit = invert(tree.find_pose(tree.root, BASE)) @ T_root_kit
             base = {BASE: {KIT: T_base_kit}}
             paths.append(_write_poses(job, BASE_FILE, "Autoware sensors calibration", base, ()))
         else:
             figures = {"format": "autoware", "file": BASE_FILE, "frame": BASE, "root": tree.root}
-            job.findings.append(NO_FRAME(tree.root, severity="note", **figures))
+            job.findings.append(NO_FRAME(tree.root, **figures))
     return paths
 
 
-def _entries(tree: FrameTree, robot: RobotTree, job: ExportJob) -> list[_Entry]:
+def _entries(tree: RobotTree, job: ExportJob) -> list[_Entry]:
     """List the sensors of a tree with their names in Autoware."""
     entries = []
     for lidar in job.rig.lidars.values():
@@ -274,20 +273,20 @@ def _entries(tree: FrameTree, robot: RobotTree, job: ExportJob) -> list[_Entry]:
             if heights_m and not lidar.frame.endswith("_base_link"):
                 T_base_lidar = pose(np.eye(3), np.array([0.0, 0.0, heights_m[0]]))
                 entry = _Entry(f"{lidar.frame}_base_link", lidar.frame, T_base_lidar)
-            entries.append(_below_kit(robot, job, lidar.frame) or entry)
+            entries.append(_below_kit(tree, job, lidar.frame) or entry)
     for name, camera in job.rig.cameras.items():
         if camera.frame in tree.frames:
             key = camera.frame if "/" in camera.frame else f"{name}/camera_link"
             entry = _Entry(key, camera.frame, np.eye(4))
-            entries.append(_below_kit(robot, job, camera.frame) or entry)
+            entries.append(_below_kit(tree, job, camera.frame) or entry)
     return entries
 
 
-def _below_kit(robot: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
+def _below_kit(tree: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
     """Find the sensor's frame directly below the kit in the robot's own tree, with the robot's way to it."""
-    if job.robot is None or frame not in job.robot.frames or KIT not in robot.chain(frame)[1:]:
+    if job.robot is None or frame not in job.robot.frames or KIT not in tree.chain(frame)[1:]:
         return None
-    chain = robot.chain(frame)
+    chain = tree.chain(frame)
     between = chain[1 : chain.index(KIT)]
     bodies = {lidar.frame for lidar in job.rig.lidars.values()}
     bodies |= {camera.frame for camera in job.rig.cameras.values()}

@@ -27,7 +27,6 @@ class Joint(NamedTuple):
         T_parent_child: (4, 4), the child's pose in the parent's frame; of a joint that moves, at zero.
         is_fixed: whether it never moves.
         name: in the robot's URDF; "" where joints have none.
-        is_optical: whether it is the rotation from a camera's body to its optical frame.
         is_given: whether the robot's own tree has it like this already.
     """
 
@@ -36,20 +35,7 @@ class Joint(NamedTuple):
     T_parent_child: Array
     is_fixed: bool = True
     name: str = ""
-    is_optical: bool = False
     is_given: bool = False
-
-
-class FrameTree(NamedTuple):
-    """Frames under one root; joints with parents first."""
-
-    root: str
-    joints: tuple[Joint, ...]
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """All frames, the root first."""
-        return (self.root, *(joint.child for joint in self.joints))
 
 
 class JointChange(NamedTuple):
@@ -83,12 +69,17 @@ class RobotTree:
     Attributes:
         source: the file it was read from, for messages.
         frames: all frames.
-        above: the joint of each frame that has a parent.
+        above: the joint of each frame that has a parent; of trees to be written, parents first.
     """
 
     source: str
     frames: frozenset[str]
     above: Mapping[str, Joint]
+
+    @property
+    def root(self) -> str:
+        """The first frame without a parent."""
+        return next(joint.parent for joint in self.above.values() if joint.parent not in self.above)
 
     @classmethod
     def of_joints(
@@ -258,7 +249,7 @@ def fit_tree(
 
 def build_trees(
     calibrations: Sequence[Calibration], rig: Rig, robot: RobotTree | None = None
-) -> list[FrameTree]:
+) -> list[RobotTree]:
     """Connect all calibrated sensors to the robot's root, or to the rig's; unconnected ones form other trees.
 
     A tree holds the sensors, their optical frames and all that lies between them and the topmost frame that
@@ -276,13 +267,9 @@ def build_trees(
         for frame in (*group, *(optical[body] for body in group if body in optical)):
             *below, root = tree.fixed_chain(frame)
             for child in reversed(below):
-                joint = tree.above[child]
-                is_optical = optical.get(joint.parent) == child and np.allclose(
-                    joint.T_parent_child, T_BODY_OPTICAL, atol=1e-9
-                )
-                joint = joint._replace(is_optical=is_optical, is_given=child not in changed)
+                joint = tree.above[child]._replace(is_given=child not in changed)
                 joints.setdefault(root, {}).setdefault(child, joint)
-    return [FrameTree(root, tuple(below.values())) for root, below in joints.items()]
+    return [RobotTree("the tree", frozenset({root, *below}), below) for root, below in joints.items()]
 
 
 def _mounted(robot: RobotTree | None, rig: Rig) -> tuple[RobotTree, list[JointChange]]:
@@ -340,7 +327,7 @@ def _placed(
                 f"Name the frame above {camera.optical_frame} as this camera's `frame` in the profile.",
             )
         T_body_optical = tree.find_pose(camera.frame, camera.optical_frame)
-    optical = Joint(camera.frame, camera.optical_frame, T_body_optical, is_optical=True)
+    optical = Joint(camera.frame, camera.optical_frame, T_body_optical)
     T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
     if anchor == lidar:
         joint = _place(tree, lidar, camera.frame, T_lidar_body)

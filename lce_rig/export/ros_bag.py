@@ -189,7 +189,7 @@ def _write_tf_static(writer: Any, job: ExportJob, stamp_ns: int) -> None:
     )
     store = typestore(False)
     topic = writer.add_connection(_TF_STATIC, _TF_TYPE, typestore=store, offered_qos_profiles=[latched])
-    joints = [joint for tree in job.trees for joint in tree.joints]
+    joints = [joint for tree in job.trees for joint in tree.above.values()]
     names = ("Vector3", "Quaternion", "Transform", "TransformStamped")
     vector, quaternion, transform, stamped = (store.types[f"geometry_msgs/msg/{name}"] for name in names)
     transforms = []

@@ -96,9 +96,13 @@ def load_camera_info(path: Path) -> Intrinsics:
 _OPTIONS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 
 
+def _own_joints(job: ExportJob) -> list[Joint]:
+    return [joint for tree in job.trees for joint in tree.above.values() if not joint.is_given]
+
+
 def export_static_tf(job: ExportJob) -> list[Path]:
     """Write static_transforms.txt."""
-    joints = [joint for tree in job.trees for joint in tree.joints if not joint.is_given]
+    joints = _own_joints(job)
     lines = [f"# {line}" for line in job.head("static transforms", *job.calibrations)]
     lines += [
         "# each line gives the pose of the child in its parent; publish either these or the URDF, not both"
@@ -124,7 +128,7 @@ def export_ros2_launch(job: ExportJob) -> list[Path]:
         "def generate_launch_description():",
         "    return LaunchDescription(",
         "        [",
-        *(line for tree in job.trees for joint in tree.joints if not joint.is_given for line in _node(joint)),
+        *(line for joint in _own_joints(job) for line in _node(joint)),
         "        ]",
         "    )",
     ]

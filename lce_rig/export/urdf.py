@@ -2,9 +2,6 @@
 
 The robot's tree of frames is read from its URDF or from a recording. An edited URDF keeps its comments, its
 order and everything else.
-
-References:
-    https://nvidia-isaac-ros.github.io/robots/isaac_urdf_requirements (base_link; body and optical frames)
 """
 
 import re
@@ -21,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import SessionError, SourceError, reading
 from lce_rig.core.geometry import pose
-from lce_rig.export import NO_FRAME, ExportJob
-from lce_rig.export.robot_tree import FrameTree, Joint, JointChange, RobotTree, fit_tree
-from lce_rig.export.writing import RPY_BODY_OPTICAL, number, rpy
+from lce_rig.export import ExportJob
+from lce_rig.export.robot_tree import Joint, JointChange, RobotTree, fit_tree
+from lce_rig.export.writing import number, rpy
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
@@ -32,7 +29,6 @@ _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 _UNIT_TOLERANCE = 1e-3
 _ORIGIN = re.compile(rb"""<origin\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
-_ISAAC_FILE, _ISAAC_BASE = "isaac_calibration.urdf", "base_link"
 
 
 def export_urdf(job: ExportJob) -> list[Path]:
@@ -44,27 +40,15 @@ def export_urdf(job: ExportJob) -> list[Path]:
     ]
 
 
-def export_isaac(job: ExportJob) -> list[Path]:
-    """Write isaac_calibration.urdf, the tree below base_link, for Isaac's /etc/nova/calibration."""
-    paths = []
-    for tree in job.trees:
-        if tree.root == _ISAAC_BASE:
-            paths.append(job.write(_ISAAC_FILE, _urdf(tree, job)))
-        else:
-            finding = NO_FRAME(tree.root, format="isaac", file=_ISAAC_FILE, frame=_ISAAC_BASE, root=tree.root)
-            job.findings.append(finding)
-    return paths
-
-
-def _urdf(tree: FrameTree, job: ExportJob) -> list[str]:
+def _urdf(tree: RobotTree, job: ExportJob) -> list[str]:
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
     # A double hyphen would end an XML comment early. ROS 2 reads a parameter's value as YAML, in which ": "
     # makes a mapping: `robot_description:="$(cat rig.urdf)"` would be refused.
     head = job.head("URDF", *job.calibrations)
     lines += [f"<!-- {line.replace('--', '- -').replace(': ', ' - ')} -->" for line in head]
     lines.append(f"<robot name={quoteattr(job.rig.name)}>")
-    lines += [f"  <link name={quoteattr(frame)}/>" for frame in tree.frames]
-    lines += [line for joint in tree.joints for line in joint_lines(joint)]
+    lines += [f"  <link name={quoteattr(frame)}/>" for frame in (tree.root, *tree.above)]
+    lines += [line for joint in tree.above.values() for line in joint_lines(joint)]
     return [*lines, "</robot>"]
 
 
@@ -81,9 +65,8 @@ def joint_lines(joint: Joint) -> list[str]:
 
 def origin(joint: Joint) -> str:
     """Write the origin of a joint."""
-    angles = RPY_BODY_OPTICAL if joint.is_optical else rpy(joint.T_parent_child[:3, :3])
     xyz = " ".join(number(value) for value in joint.T_parent_child[:3, 3])
-    turn = " ".join(number(value) for value in angles)
+    turn = " ".join(number(value) for value in rpy(joint.T_parent_child[:3, :3]))
     return f'<origin xyz="{xyz}" rpy="{turn}"/>'
 
 

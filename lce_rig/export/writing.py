@@ -17,7 +17,6 @@ from lce_rig.rig.loading import dump_yaml
 # REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own.
 R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 T_BODY_OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
-RPY_BODY_OPTICAL = (-np.pi / 2, 0.0, -np.pi / 2)
 
 
 def number(value: float) -> str:

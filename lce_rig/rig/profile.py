@@ -45,7 +45,6 @@ OutputFormat = Literal[
     "fast_livo2",
     "koide3",
     "opencv",
-    "isaac",
     "mcap",
     "ply",
 ]

@@ -123,7 +123,7 @@ _VALUES = {
     "--name": "second",
     "--registry": "registry",
     "--target": "kestrel",
-    "--formats": "isaac",
+    "--formats": "autoware",
     "--tree": "robot.urdf",
     "--reason": "asked",
     "--release": "EARLIER",

@@ -95,15 +95,6 @@ def _urdf(case, name=None):
     return project(case.points_lidar, np.asarray(robot.get_transform(lidar, optical)), case.lens)
 
 
-def _isaac(case):
-    from yourdfpy import URDF
-
-    path = case.folder / "isaac_calibration.urdf"
-    if URDF.load(str(path), load_meshes=False).base_link != "base_link":
-        raise ValueError("the root is not base_link")
-    return _urdf(case, path.name)
-
-
 def _info_lens(data):
     model = "fisheye" if data["distortion_model"] == "equidistant" else "radtan"
     K = np.reshape(data["camera_matrix"]["data"], (3, 3))
@@ -320,7 +311,6 @@ READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
     ("fast_livo2", "PyYAML, OpenCV"): _fast_livo2,
     ("koide3", "json, OpenCV"): _koide3,
     ("opencv", "cv::FileStorage"): _opencv,
-    ("isaac", "yourdfpy"): _isaac,
     ("mcap", "mcap, mcap-ros2-support"): _mcap,
     ("ply", "Open3D"): _ply,
 }

@@ -83,7 +83,7 @@ def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(rles, make, tmp_
     np.testing.assert_allclose(robot.find_pose("base_link", "mast"), placed(0.5), atol=1e-12)
     (tree,) = build_trees([make()], rles, robot)
     assert tree.root == "base_link"
-    joints = {joint.child: joint for joint in tree.joints}
+    joints = tree.above
     # The camera is nearer to the root and stays; the LiDAR keeps its parent.
     assert {child: (j.parent, j.is_given) for child, j in joints.items()} == {
         "davis_link": ("base_link", True),
@@ -142,7 +142,7 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path)
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [ROBOT[:1]]))
     mount = Mount(parent="mast", of="velodyne", xyz_m=(0.0, 0.0, 0.4))
     (tree,) = build_trees([make()], rles.model_copy(update={"mount": mount}), robot)
-    assert {j.child: (j.parent, j.is_given) for j in tree.joints}["velodyne"] == ("mast", False)
+    assert (tree.above["velodyne"].parent, tree.above["velodyne"].is_given) == ("mast", False)
     other = rles.model_copy(update={"mount": mount.model_copy(update={"parent": "roof"})})
     with pytest.raises(SessionError):
         build_trees([make()], other, robot)
@@ -150,15 +150,6 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path)
     elsewhere = rles.model_copy(update={"mount": mount.model_copy(update={"parent": "base_link"})})
     with pytest.raises(LceRigError):
         build_trees([make()], elsewhere, whole)
-    # The robot's own pose counts, and that is told.
-    rig = rles.model_copy(update={"mount": mount})
-    findings = []
-    export([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole, findings=findings)
-    (finding,) = findings
-    assert finding.code == "export.mount_unused"
-    assert (finding.figures["angle_deg"], finding.figures["distance_m"]) == pytest.approx(
-        (90, np.hypot(0.1, 0.2))
-    )
 
 
 def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles, make, tmp_path):
