@@ -21,7 +21,6 @@ from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
@@ -46,7 +45,7 @@ def residual_words(metrics: Metrics, c: Calibration) -> str:
 
 def _uncertainty(c: Calibration) -> Iterator[str]:
     """State the standard deviations, by axis if the result passes, and for a point at a distance."""
-    yield _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)
+    yield f"  uncertainty  {sizes(c.sigma_rotation_deg, c.sigma_translation_m)} (1 sigma)"
     if c.verdict == "fail":
         return
     names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
@@ -59,34 +58,6 @@ def _uncertainty(c: Calibration) -> Iterator[str]:
         if point.distance_m == _FAR_M:
             off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
             yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
-
-
-def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
-    return f"  uncertainty  {sizes(sigma_deg, sigma_m)} (1 sigma)"
-
-
-def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> Iterator[str]:
-    """State the poses of cameras earlier in the result relative to this one, each pair of cameras once."""
-    camera = calibration.camera
-    others = {other.camera: other for other in calibration.other_cameras}
-    for earlier in () if calibration.is_of_lidars else calibrations[: calibrations.index(calibration)]:
-        name = earlier.camera
-        if earlier.lidar != calibration.lidar:
-            continue
-        if name not in others:
-            yield f"[bold]{name} and {camera}[/]: not compared, as no still board was seen by both"
-            continue
-        other = others[name]
-        yield f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both"
-        yield f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)"
-        yield from show.matrix_lines(other.T_cam_other, "    ")
-        if other.cov is not None:
-            yield _sigma_line(*sigma_sizes(other.cov))
-        if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
-            separately = ", each camera estimated separately" if other.cov is not None else ""
-            apart = sizes(other.apart_rotation_deg, other.apart_translation_m)
-            yield f"  images       differ by {apart}{separately}"
-        yield f"  boards       {1000 * other.board_rms_m:.1f} mm apart"
 
 
 @click.command()
@@ -197,8 +168,6 @@ def calibrate(
     else:
         for c in result.pairs:
             show.print_parts(_parts(c, str(result.session.path), is_explained=explain))
-        for c in result.pairs:
-            show.print_parts(camera_lines(c, result.pairs))
     show.warn_of(finding for finding in written.findings if finding.severity != "note")
     if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
         show.warn(f"this result is not exported; the last usable result is in {written.previous}")

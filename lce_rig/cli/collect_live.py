@@ -135,11 +135,11 @@ def _open_page(stack: ExitStack, address: str) -> Preview:
     """Serve the preview page and print its link."""
     page = Preview(*parse_address(address))
 
-    def tell_troubles() -> None:
-        for text in page.notes():
-            show.note(text)
+    def tell_failure() -> None:
+        if page.failure:
+            show.note(f"preview: the page has ended: {page.failure}")
 
-    stack.callback(tell_troubles)
+    stack.callback(tell_failure)
     stack.enter_context(page)
     for url in page.urls:
         show.note(f"preview: {url}")

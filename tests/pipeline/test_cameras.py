@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.cli.calibrate import camera_lines
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, invert
@@ -113,10 +112,6 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     for own in found.values():
         assert own.estimated_with == own.other_cameras == ()
         assert np.isnan(own.diagnostics.alone_sigma_rotation_deg)
-    left, right = found.values()
-    assert list(camera_lines(left, [left, right])) == []
-    (line,) = camera_lines(right, [left, right])
-    assert "left" in line and "right" in line
 
 
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):

@@ -1,7 +1,6 @@
 """The page as the collection sees it: addresses as people write them, started, updated, closed."""
 
 import asyncio
-import errno
 import fcntl
 import logging
 import re
@@ -9,11 +8,9 @@ import secrets
 import socket
 import struct
 import threading
-from collections import Counter
 from contextlib import suppress
 
 from aiohttp import web
-from aiohttp.http_exceptions import HttpProcessingError
 
 from lce_rig.collect.live.state import LiveState, TakeBack
 from lce_rig.core.errors import UsageError
@@ -23,7 +20,8 @@ LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8765
 
 _HINT = (
-    "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080. "
+    "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080: an address of this computer "
+    "(`hostname -I` lists them, 0.0.0.0 stands for all), a free port above 1023 (`ss -ltn` lists used ones). "
     "Give the session before it: lce-rig collect --rig R session/ --preview"
 )
 # linux/sockios.h; Python names neither.
@@ -54,23 +52,8 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port))
     except (OSError, UnicodeError) as error:
-        number, why, hint = getattr(error, "errno", None), str(error), _HINT
-        if number == errno.EADDRINUSE:
-            why = "the port is in use"
-            hint = (
-                f"Another collection may be running: `ss -ltnp sport = :{port}` names it. "
-                f"Or choose another port: --preview {host}:{min(port + 1, 65535)}."
-            )
-        elif number in (errno.EACCES, errno.EPERM):
-            why = "not permitted"
-            hint = f"Ports below 1024 need root: --preview {host}:{DEFAULT_PORT}."
-        elif number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
-            why = "not an address of this computer"
-            hint = (
-                "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all. "
-                "A session's name goes before --preview."
-            )
-        raise UsageError(f"the page cannot be served at {host}:{port}: {why}", hint) from None
+        why = getattr(error, "strerror", None) or str(error)
+        raise UsageError(f"the page cannot be served at {host}:{port}: {why}", _HINT) from None
 
 
 def links(opened: socket.socket, token: str) -> tuple[str, ...]:
@@ -106,30 +89,13 @@ def _network_addresses() -> list[str]:
 
 # 72 bits: beyond guessing, and can still be typed into a phone.
 _TOKEN_BYTES = 9
-_TOKEN = re.compile(r"[A-Za-z0-9_-]{8,128}")
 _STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
 # For the rest of a request that was answered before its end.
 _LINGERING_S = 1.0
 # asyncio sets up a connection in the three turns of its loop after it has accepted it.
 _TURNS_TO_SET_UP = 4
-_LOG = logging.getLogger("lce_rig.preview")
-
-
-class _Troubles(logging.Filter):
-    """Counts the page's failures; each kind reaches the log once, and what strangers send wrongly never."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.counts: Counter[str] = Counter()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        error = record.exc_info[1] if record.exc_info else None
-        if isinstance(error, HttpProcessingError):
-            return False
-        text = record.getMessage() if error is None else f"{record.msg}: {error!r}"
-        kind = text.partition("\n")[0][:120]
-        self.counts[kind] += 1
-        return self.counts[kind] == 1
+# What strangers send wrongly must not reach the terminal that shows the collection.
+_SILENT = logging.Logger("preview", logging.CRITICAL + 1)
 
 
 class Preview:
@@ -139,27 +105,23 @@ class Preview:
 
     Attributes:
         urls: the links, the likeliest first; empty before `start`.
+        failure: that ended the page; "" for none. The collection continues without it.
 
     Args:
         address: host name or IPv4 address to bind to; "0.0.0.0" for all networks.
         port: 0 for any free one.
         token: that a browser must bring; None draws one.
-
-    Raises:
-        UsageError: the token cannot be part of a link.
     """
 
     def __init__(self, address: str = LOOPBACK, port: int = DEFAULT_PORT, token: str | None = None) -> None:
         self.urls: tuple[str, ...] = ()
+        self.failure = ""
         self._address = address
         self._port = port
         self._token = secrets.token_urlsafe(_TOKEN_BYTES) if token is None else token
-        if not _TOKEN.fullmatch(self._token):
-            raise UsageError("the page's token cannot be used", "Take 8 to 128 letters, digits, '-' or '_'.")
         self._thread: threading.Thread | None = None
         self._is_ready = threading.Event()
         self._feed = Feed()
-        self._troubles = _Troubles()
         self._pages: Pages | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
@@ -190,11 +152,6 @@ class Preview:
         """Images that were compressed, 0 while the page is not open."""
         return 0 if self._pages is None else self._pages.encoder.n_encoded
 
-    def notes(self) -> list[str]:
-        """Report the page's failures, and how often; the collection continues after any of them."""
-        counts = self._troubles.counts.most_common(20)
-        return [f"preview: {kind}" + (f" ({n} times)" if n > 1 else "") for kind, n in counts]
-
     def close(self) -> None:
         """Let open pages have the last state, and end."""
         if self._thread is None or self._loop is None or self._stop is None:
@@ -215,13 +172,11 @@ class Preview:
         self.close()
 
     def _run(self, opened: socket.socket) -> None:
-        _LOG.addFilter(self._troubles)
         try:
             asyncio.run(self._serve(opened))
-        except Exception:  # If the page ends, the collection continues.
-            _LOG.exception("the page has ended, the collection goes on")
+        except Exception as error:
+            self.failure = repr(error)
         finally:
-            _LOG.removeFilter(self._troubles)
             opened.close()
             self._is_ready.set()
 
@@ -232,7 +187,7 @@ class Preview:
             self._pages.application(),
             handle_signals=False,
             access_log=None,
-            logger=_LOG,
+            logger=_SILENT,
             shutdown_timeout=_SHUTDOWN_S,
             keepalive_timeout=_KEEP_ALIVE_S,
             lingering_time=_LINGERING_S,

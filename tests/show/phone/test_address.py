@@ -40,9 +40,8 @@ def test_what_is_no_address_is_refused_with_examples(text):
 def test_a_port_in_use_is_said_to_be():
     with Preview(port=0) as first:
         port = port_of(first)
-        with pytest.raises(UsageError) as caught:
+        with pytest.raises(UsageError):
             Preview(port=port).start()
-    assert f"--preview 127.0.0.1:{port + 1}" in caught.value.hint
     with Preview(port=port):
         pass  # it is free again at once
 
