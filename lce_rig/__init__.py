@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lce_rig.calibrate import CalibrateOptions
-    from lce_rig.collect.offline import CollectOptions
     from lce_rig.core.calibration import Calibration, ResultFile, read_result
     from lce_rig.core.data import Events, Image, Scan
     from lce_rig.core.errors import (
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
 __all__ = [
     "CalibrateOptions",
     "Calibration",
-    "CollectOptions",
     "Detections",
     "DriftReport",
     "Events",
@@ -92,7 +90,6 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _HOMES = {
     "lce_rig.calibrate": ("CalibrateOptions",),
-    "lce_rig.collect.offline": ("CollectOptions",),
     "lce_rig.core.calibration": ("Calibration", "ResultFile", "read_result"),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),

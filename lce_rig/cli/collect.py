@@ -14,7 +14,6 @@ from lce_rig.cli.simulate import require_kind
 from lce_rig.collect.findings import IMAGE_NONE
 from lce_rig.collect.gates import stillness_window_s
 from lce_rig.collect.live.guide import predict
-from lce_rig.collect.offline import CollectOptions
 from lce_rig.collect.offline import collect as collect_into
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
@@ -168,9 +167,8 @@ def collect(
     )
     sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
-    options = CollectOptions(target=n_wanted)
     with show.progress_bar("collecting") as progress, Session.resume(session, rig) as writer:
-        report = collect_into(writer, recordings, options, lambda done, total, _: progress(done, total))
+        report = collect_into(writer, recordings, n_wanted, progress)
     _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, FolderRecording) for recording in recordings):

@@ -1,6 +1,6 @@
 """Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -17,6 +17,7 @@ from lce_rig.collect.placement_dedupe import (
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Losses, Refusal
+from lce_rig.core.progress import Progress, silent
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import (
     ContinuousRecording,
@@ -34,20 +35,6 @@ from lce_rig.timing.scan_pairing import pair_by_time
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
 _LONG_SAMPLES = 200
-
-Progress = Callable[[int, int, str], None]
-"""Told (samples done, samples in all, what happened)."""
-
-
-@dataclass(frozen=True)
-class CollectOptions:
-    """What becomes a capture.
-
-    Attributes:
-        target: number of captures wanted: recordings are read until the session has as many; None for all.
-    """
-
-    target: int | None = None
 
 
 @dataclass
@@ -82,8 +69,8 @@ class CollectReport:
 def collect(
     session: Session,
     recordings: Sequence[Recording],
-    options: CollectOptions | None = None,
-    progress: Progress | None = None,
+    n_wanted: int | None = None,
+    progress: Progress = silent,
 ) -> CollectReport:
     """Fill a session from recordings.
 
@@ -92,11 +79,17 @@ def collect(
     moment of every place that the board passes slowly, and the raw events about it are kept. Recordings of
     the same moment by several recorders are read as one. What an earlier run captured is not captured again.
 
+    Args:
+        session: open for writing.
+        recordings: in any order.
+        n_wanted: captures wanted: recordings are read until the session has as many; None for all.
+        progress: called with (done, total) samples or pairs.
+
     Raises:
         SourceError: nothing could be read at all; it names the first file and the cause.
         SessionError: the session cannot be written; what was captured before is safe.
     """
-    collector = _Collector(session, options or CollectOptions(), progress or (lambda *_: None))
+    collector = _Collector(session, n_wanted, progress)
     for recording in join_recordings(recordings, session.rig):
         collector.report.note(recording.notes)
         try:
@@ -112,10 +105,10 @@ def collect(
 
 
 class _Collector:
-    def __init__(self, session: Session, options: CollectOptions, progress: Progress) -> None:
+    def __init__(self, session: Session, n_wanted: int | None, progress: Progress) -> None:
         self.report = CollectReport()
         self._session = session
-        self._options = options
+        self._n_wanted = n_wanted
         self._progress = progress
         self._rejected = {capture.name: capture for capture in session.rejected}
         # Captures, rejected ones included, by the key of their data.
@@ -143,16 +136,15 @@ class _Collector:
             try:
                 key = files.key()
                 if key in self._names_by_key:
-                    message = self._count_known(files.label, self._names_by_key[key])
+                    self.report.n_known += 1
                 else:
                     images, scans, notes = files.read()
                     self.report.note(notes)
-                    message = self._store(key, files.label, images, scans, {})
+                    self._store(key, files.label, images, scans, {})
             except SourceError as error:
                 failures.append(error)
                 self.report.refused[files.label] = refusal_of("read", error, "record it again")
-                message = f"{files.label} refused: {error.what}"
-            self._progress(done + 1, len(recording.pairs), message)
+            self._progress(done + 1, len(recording.pairs))
         if n_left_out:
             self.report.note(
                 [f"{n_left_out} pairs left out: the session holds {self._n_captures} captures, as wanted"]
@@ -234,8 +226,8 @@ class _Collector:
             SourceError: nothing could be read and the session is empty.
         """
         report = self.report
-        if self._options.target is not None:
-            report.n_missing = max(0, self._options.target - self._n_captures)
+        if self._n_wanted is not None:
+            report.n_missing = max(0, self._n_wanted - self._n_captures)
         self._session.journal(
             "collected",
             captured=len(report.captured),
@@ -260,7 +252,7 @@ class _Collector:
         key = f"{recording.key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
-            self._count_known(label, self._names_by_key[key])
+            self.report.n_known += 1
             return
         if known.find_like(poses) is not None:
             self.report.counts.add(CALIBRATE_SAME_PLACEMENT.refusal())
@@ -279,23 +271,18 @@ class _Collector:
         scans: Sequence[Scan],
         figures: dict[str, object],
         events: Sequence[Events] = (),
-    ) -> str:
-        duplicate = self._session.find_duplicate(images, scans, events)
-        if duplicate is not None:
-            return self._count_known(label, duplicate)
+    ) -> None:
+        if self._session.find_duplicate(images, scans, events) is not None:
+            self.report.n_known += 1
+            return
         meta = {"source": {"key": key, "label": label}, **figures}
         name = self._session.add_capture(images, scans, meta, events)
         self._names_by_key[key] = name
         self._n_captures += 1
         self.report.captured.append(name)
-        return f"{label} captured as {name}"
-
-    def _count_known(self, label: str, name: str) -> str:
-        self.report.n_known += 1
-        return f"{label} is capture {name} already"
 
     def _is_enough(self) -> bool:
-        return self._options.target is not None and self._n_captures >= self._options.target
+        return self._n_wanted is not None and self._n_captures >= self._n_wanted
 
     def _read(self, recording: ContinuousRecording) -> Iterator[Sample]:
         """Yield samples up to a tear, whose error is kept: moments before it are still captured."""
@@ -305,6 +292,6 @@ class _Collector:
                 yield sample
                 if not isinstance(sample, Events):
                     done += 1
-                    self._progress(done, recording.n_samples, f"{len(self.report.captured)} captured")
+                    self._progress(done, recording.n_samples)
         except SourceError as error:
             self._torn = error

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.offline import CollectOptions, collect
+from lce_rig.collect.offline import collect
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress, silent
@@ -21,7 +21,7 @@ def collect_from(
     recordings: Source | list[Source] | tuple[Source, ...],
     session: Path | str,
     *,
-    options: CollectOptions | None = None,
+    n_wanted: int | None = None,
     sources: SourceOptions | Sequence[SourceOptions] | None = None,
     progress: Progress = silent,
 ) -> Session:
@@ -32,7 +32,7 @@ def collect_from(
         recordings: paths of folders, bags and files, or readers with the attributes of `Recording`; several
             simultaneous ones are read as one.
         session: its folder.
-        options: what becomes a capture.
+        n_wanted: captures wanted: recordings are read until the session has as many; None for all.
         sources: how to read the paths, if the profile does not say: all alike, or each by its own.
         progress: called with (done, total) samples.
 
@@ -56,7 +56,7 @@ def collect_from(
         part = replace(how, is_part=len(given) > 1)
         opened += open_recordings([Path(source)], rig, part) if isinstance(source, str | Path) else [source]
     with Session.resume(session, rig) as writer:
-        report = collect(writer, opened, options, lambda done, total, _message: progress(done, total))
+        report = collect(writer, opened, n_wanted, progress)
     if report.errors:
         raise report.errors[0]
     filled = Session.open(session)

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from lce_rig.collect.offline import CollectOptions, collect
+from lce_rig.collect.offline import collect
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.session import Session
@@ -55,10 +55,10 @@ def test_a_rejected_placement_is_not_captured_again_from_its_recording(collected
 @pytest.mark.long
 def test_a_recording_stops_at_the_target_or_says_what_is_missing(tmp_path, bag, rig):
     with Session.create(tmp_path / "one", rig) as session:
-        report = collect(session, [open_recording(bag, rig)], CollectOptions(target=1))
+        report = collect(session, [open_recording(bag, rig)], n_wanted=1)
     assert (len(report.captured), report.n_missing) == (1, 0)
     with Session.resume(tmp_path / "one", rig) as session:
-        report = collect(session, [open_recording(bag, rig)], CollectOptions(target=5))
+        report = collect(session, [open_recording(bag, rig)], n_wanted=5)
     assert (len(session.captures), report.n_missing) == (2, 3)
 
 

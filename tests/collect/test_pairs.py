@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.collect.offline import CollectOptions, collect
+from lce_rig.collect.offline import collect
 from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
 from lce_rig.io import open_recording
@@ -41,7 +41,7 @@ def folder(tmp_path):
 
 
 def run(session, folder, rig, **options):
-    return collect(session, [open_recording(folder, rig)], CollectOptions(**options))
+    return collect(session, [open_recording(folder, rig)], **options)
 
 
 def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folder, rig):
@@ -98,10 +98,10 @@ def test_a_folder_of_which_nothing_can_be_read_is_an_error_that_names_the_first_
 
 def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
-        report = run(session, folder, rig, target=2)
+        report = run(session, folder, rig, n_wanted=2)
         assert len(session.captures) == 2 and report.n_missing == 0
         assert any(note.startswith("3 pairs") and "2 captures" in note for note in report.notes)
-        assert len(run(session, folder, rig, target=4).captured) == 2
+        assert len(run(session, folder, rig, n_wanted=4).captured) == 2
         assert len(run(session, folder, rig).captured) == 1
 
 
