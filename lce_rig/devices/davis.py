@@ -27,7 +27,7 @@ from lce_rig.rig import CameraSettings
 
 # A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
 _N_SLOTS = 2048
-_PAUSE_S = 0.002
+_PAUSE_S, _SILENCE_S = 0.002, 5.0
 _MAX_CLOCK_ERROR_MS = 500.0
 _RISING, _RESET = "EXTERNAL_SIGNAL_RISING_EDGE", "TIMESTAMP_RESET"
 _US_S = 1e6
@@ -67,7 +67,6 @@ class DavisSource(LiveSource):
         sensor: the camera's name in the profile.
         settings: its block of the profile.
         open_camera: opens it; another input of dv-processing (file, network) does as well.
-        silence_s: so long without a sample is an error.
     """
 
     def __init__(
@@ -75,9 +74,8 @@ class DavisSource(LiveSource):
         sensor: str,
         settings: CameraSettings,
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
-        silence_s: float = 5.0,
     ) -> None:
-        super().__init__(sensor, f"camera {sensor!r}", silence_s, _SILENT_HINT, _N_SLOTS)
+        super().__init__(sensor, f"camera {sensor!r}", _SILENCE_S, _SILENT_HINT, _N_SLOTS)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._opened = OpenedCamera(None, "")

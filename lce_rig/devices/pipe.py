@@ -16,7 +16,7 @@ from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig import CameraSettings
 
-_WAIT_S = 0.25
+_WAIT_S, _SILENCE_S = 0.25, 10.0
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
 _TAIL_BYTES = 2000
@@ -34,12 +34,11 @@ class ImagePipeSource(LiveSource):
     Args:
         sensor: the camera's name in the profile.
         settings: its block of the profile.
-        silence_s: so long without an image is an error.
     """
 
-    def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 10.0) -> None:
+    def __init__(self, sensor: str, settings: CameraSettings) -> None:
         hint = f"Run its command in a shell: does it write images? {' '.join(settings.driver.command)}"
-        super().__init__(sensor, f"camera {sensor!r}", silence_s, hint)
+        super().__init__(sensor, f"camera {sensor!r}", _SILENCE_S, hint)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
         self._stack = ExitStack()

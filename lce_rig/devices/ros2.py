@@ -15,7 +15,7 @@ from lce_rig.io.ros.rosbag import TopicDecoder
 from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 
-_WAIT_S = 0.25
+_WAIT_S, _SILENCE_S = 0.25, 5.0
 # Nodes find each other within a second on one computer, within a few on a network.
 _DISCOVERY_S = 5.0
 _DISCOVERY_STEP_S = 0.1
@@ -30,10 +30,9 @@ class Ros2Source(LiveSource):
     Args:
         sensor: its name in the profile.
         settings: its block of the profile.
-        silence_s: so long without a message is an error.
     """
 
-    def __init__(self, sensor: str, settings: CameraSettings | LidarSettings, silence_s: float = 5.0) -> None:
+    def __init__(self, sensor: str, settings: CameraSettings | LidarSettings) -> None:
         if isinstance(settings, CameraSettings):
             channel = settings.first_channel("frames") or next(iter(settings.channels))
             named, who = settings.channels[channel].topic, f"camera {sensor!r}"
@@ -43,7 +42,7 @@ class Ros2Source(LiveSource):
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
         hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
-        super().__init__(sensor, who, silence_s, hint)
+        super().__init__(sensor, who, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
         self._waiting: list[tuple[int, bytes]] = []

@@ -44,15 +44,12 @@ class SyncBoard(LiveSource):
     Args:
         settings: how the board is reached, and which camera each line triggers.
         hello_s: how long to wait for its first words.
-        silence_s: so long without a message is an error.
     """
 
-    def __init__(
-        self, settings: SyncSettings, hello_s: float = HELLO_S, silence_s: float = SILENCE_S
-    ) -> None:
+    def __init__(self, settings: SyncSettings, hello_s: float = HELLO_S) -> None:
         super().__init__(BOARD, f"sync board '{BOARD}'", math.inf, n_slots=_N_SLOTS)
         self._settings = settings
-        self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
+        self._hello_s = hello_s
         self._state = BoardState({trigger.channel: camera for camera, trigger in settings.triggers.items()})
         self._lock = threading.Lock()
         self._early: list[Pulse] = []
@@ -126,9 +123,9 @@ class SyncBoard(LiveSource):
         self._heard = (self._heard + data)[:_N_HEARD_BYTES]
         with self._lock:
             pulses = self._state.feed(data, arrival)
-            if self._is_set_up and arrival.steady_ns - self._state.heard_ns > self._silence_ns:
+            if self._is_set_up and arrival.steady_ns - self._state.heard_ns > SILENCE_S * NS_PER_S:
                 raise SourceError(
-                    f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
+                    f"{self._who} fell silent: nothing for {SILENCE_S:g} s",
                     "Check its cable and power, and press its reset.",
                 )
             has_restarted = self._state.n_restarts != self._n_restarts

@@ -231,7 +231,7 @@ class PairJudge:
             judged = replace(judged, findings=(*judged.findings, untimed))
         if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
             judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
-        if len(moving) >= _MIN_MOVING and judged.curves:
+        if len(moving) >= _MIN_MOVING and judged.is_compared:
             judged = _with_clocks(judged, moving, lens, c.camera)
         example = None
         if whole:

@@ -28,7 +28,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
     c = calibration
     views = scene_views(session, detections, c)
     drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov)
-    return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.curves else ())
+    return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.is_compared else ())
 
 
 def scene_views(session: Session, detections: Detections, c: Calibration) -> list[SceneView]:

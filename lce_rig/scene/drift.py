@@ -1,11 +1,11 @@
 """Whether extrinsics still hold, axis by axis, from the scene's edges alone."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.core.calibration import MOTIONS, AxisDrift, Motion, State
+from lce_rig.core.calibration import MOTIONS, AxisDrift, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import KINDS, Finding
 from lce_rig.core.geometry import Array, perturb
@@ -58,16 +58,16 @@ class Drift:
         axes: one verdict each, order of MOTIONS; all "unknown" where nothing could be compared.
         findings: the summary first, then one of each axis and what is missing.
         T_cam_lidar: (4, 4) deployed.
-        curves: the score along each axis about the deployed extrinsics; empty where nothing was compared.
         n_captures, n_edges: compared.
+        is_compared: whether there were edges enough.
     """
 
     axes: tuple[AxisDrift, ...]
     findings: tuple[Finding, ...]
     T_cam_lidar: Array
-    curves: Mapping[Motion, Curve]
     n_captures: int
     n_edges: int
+    is_compared: bool = True
 
     @property
     def state(self) -> State:
@@ -110,7 +110,7 @@ def watch(views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
         few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
         axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in MOTIONS)
-        return Drift(axes, (few, *missing), T_cam_lidar, {}, len(views), n_edges)
+        return Drift(axes, (few, *missing), T_cam_lidar, len(views), n_edges, is_compared=False)
 
     sigma_deployed = np.sqrt(np.diag(cov))
     curves = [alignment.curve(axis, np.zeros(6)) for axis in range(6)]
@@ -125,8 +125,7 @@ def watch(views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array
             findings.append(AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures))
         else:
             findings.append(KINDS[axis.reason or AXIS_UNCHANGED.code](axis.axis, **axis.figures))
-    by_axis = dict(zip(MOTIONS, curves, strict=True))
-    return Drift(axes, (*findings, *missing), T_cam_lidar, by_axis, len(views), n_edges)
+    return Drift(axes, (*findings, *missing), T_cam_lidar, len(views), n_edges)
 
 
 def _decide(alignment: Alignment, curves: list[Curve], sigma_deployed: Array) -> tuple[AxisDrift, ...]:

@@ -328,7 +328,7 @@ def plan_captures(
         rms_m = figures.fit_plane_rms_m, figures.fit_edge_rms_m
         if np.isfinite(rms_m).all():
             model = replace(model, errors=model.errors.learned(*rms_m, len(held)))
-    planner, wanted, needed = Planner(SensorPlace.upright(model, T_cam_lidar)), held, rig.calibration
+    planner, wanted, needed = Planner(SensorPlace(model, T_cam_lidar)), held, rig.calibration
     guidance = planner.guide(held)
     # What the calibration states over what the model predicts.
     ratios = np.ones(2)

@@ -170,17 +170,15 @@ class SensorPlace:
     Attributes:
         model: the sensors.
         T_cam_lidar: (4, 4) rough extrinsic.
-        up: (3,) unit vector upwards, frame camera.
     """
 
     model: SensorModel
     T_cam_lidar: Array
-    up: Array
 
-    @classmethod
-    def upright(cls, model: SensorModel, T_cam_lidar: Array) -> "SensorPlace":
-        """Take the LiDAR's z axis for the vertical, as spinning LiDARs stand upright."""
-        return cls(model, T_cam_lidar, np.asarray(T_cam_lidar[:3, 2]))
+    @property
+    def up(self) -> Array:
+        """The unit vector upwards (3,), frame camera: the z axis of the LiDAR, which stands upright."""
+        return np.asarray(self.T_cam_lidar[:3, 2])
 
     @classmethod
     def nominal(cls, rig: Rig, camera: str, lidar: str) -> "SensorPlace":
@@ -195,7 +193,7 @@ class SensorPlace:
                 f"rig {rig.name!r} has no nominal extrinsics of {camera} and {lidar}",
                 "Add them under nominal_extrinsics.",
             )
-        return cls.upright(SensorModel.of(rig, camera, lidar), nominal.to_matrix())
+        return cls(SensorModel.of(rig, camera, lidar), nominal.to_matrix())
 
 
 def spread_candidates(view: SensorPlace, n_places: int) -> Array:

@@ -81,7 +81,7 @@ class Guide:
         if nominal is None:
             self.problem = GUIDE_NO_NOMINAL(n_captures=rig.quality.min_captures, camera=key[0], lidar=lidar)
         else:
-            self._planner = Planner(SensorPlace.upright(self._model, nominal.to_matrix()))
+            self._planner = Planner(SensorPlace(self._model, nominal.to_matrix()))
         self._at_first = self._planner, self.problem
 
     @property
@@ -147,7 +147,7 @@ class Guide:
         if self._model is None:
             return None
         errors = self._model.errors.learned(plane_rms_m, edge_rms_m, n_captures)
-        return Planner(SensorPlace.upright(replace(self._model, errors=errors), T_cam_lidar))
+        return Planner(SensorPlace(replace(self._model, errors=errors), T_cam_lidar))
 
     def adopt(self, planner: Planner | None) -> None:
         """Take a planner from `prepare`; None to go back to the one before any capture."""

@@ -37,7 +37,7 @@ def model(errors=None):
 
 def view(errors=None):
     """Look along the LiDAR's x axis."""
-    return SensorPlace.upright(model(errors), T_FORWARD)
+    return SensorPlace(model(errors), T_FORWARD)
 
 
 def placements(n, seed):

@@ -21,7 +21,7 @@ def plan(rig, held):
 def placements():
     """Placements that guidance itself would choose, the best first."""
     rig = load_rig("rlfs")
-    view = SensorPlace.upright(SensorModel.of(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
+    view = SensorPlace(SensorModel.of(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
     planner, held = Planner(view), np.zeros((0, 4, 4))
     for _ in range(5):
         held = np.concatenate([held, planner.guide(held).T_cam_board[None]])

@@ -99,10 +99,10 @@ def test_of_placements_nearly_as_good_the_nearest_is_taken(planner, guided):
 def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
     modest = replace(model(), target_sigma_rad=np.radians(0.5), target_sigma_m=0.03)
     strict = replace(model(), target_sigma_rad=np.radians(0.02), target_sigma_m=0.001)
-    few = Planner(SensorPlace.upright(modest, T_FORWARD), n_places=20)
+    few = Planner(SensorPlace(modest, T_FORWARD), n_places=20)
     assert few.guide(guided).is_enough
     assert not few.guide(guided[: model().limits.min_captures - 1]).is_enough
-    assert not Planner(SensorPlace.upright(strict, T_FORWARD), n_places=20).guide(guided).is_enough
+    assert not Planner(SensorPlace(strict, T_FORWARD), n_places=20).guide(guided).is_enough
 
 
 def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guided):
@@ -129,7 +129,7 @@ def test_without_rings_the_whole_plate_is_kept_in_the_field_of_view():
     shape = {"elevations_rad": np.radians(np.arange(-20.0, 20.5, 0.5)), "width_rad": np.radians(60.0)}
     n_placed = []
     for pattern in ("rings", "any", "rosette"):
-        place = SensorPlace.upright(replace(model(), pattern=pattern, **shape), T_FORWARD)
+        place = SensorPlace(replace(model(), pattern=pattern, **shape), T_FORWARD)
         poses = Planner(place, n_places=100).candidates
         n_placed.append(len(poses))
         outline = transform(invert(T_FORWARD) @ poses, model().board.outline())
@@ -170,7 +170,7 @@ def test_beyond_the_target_only_what_was_captured_is_refused():
     refusal = bold.adds_nothing(crowd, present)
     assert refusal.code == "calibrate.little_gain" and refusal.figure("gain") < refusal.figure("best_gain")
     modest = replace(model(), target_sigma_rad=np.radians(20.0), target_sigma_m=1.0)
-    met = Planner(SensorPlace.upright(modest, T_FORWARD), 0.001, 0.05, n_places=100)
+    met = Planner(SensorPlace(modest, T_FORWARD), 0.001, 0.05, n_places=100)
     assert met.guide(crowd).is_enough
     assert met.adds_nothing(crowd, present) is None
     assert met.adds_nothing(crowd, crowd[2]).figures["capture"] == "3"
