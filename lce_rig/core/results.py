@@ -10,18 +10,13 @@ from numpy.typing import NDArray
 from lce_rig.core.data import NO_RING
 from lce_rig.core.geometry import Array
 
-# The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
-_AMBIGUOUS_CHI2 = 9.0
-
 
 @dataclass(frozen=True)
 class ImageQuality:
     """What an image shows of the pattern.
 
     Attributes:
-        mean_grey: of the whole image, grey values.
         contrast: white minus black squares, grey values.
-        noise: standard deviation, grey values.
         square_px: shortest side of a square.
         edge_width_px: of the squares' edges, 10-90 %.
         sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
@@ -29,9 +24,7 @@ class ImageQuality:
         n_corners: that could be fitted.
     """
 
-    mean_grey: float
     contrast: float
-    noise: float
     square_px: float
     edge_width_px: float
     sharpness: float
@@ -49,7 +42,6 @@ class EventQuality:
         speed_mps, turn_deg_s: of the board about the time of the image.
         speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
         smear_m: how far the board moves while the LiDAR scans it.
-        smear_depth_m: the part of it along the board's normal, which thickens or tilts the plane.
     """
 
     events_px_s: float
@@ -59,7 +51,6 @@ class EventQuality:
     turn_deg_s: float = math.nan
     turn_sigma_deg_s: float = math.nan
     smear_m: float = math.nan
-    smear_depth_m: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -69,7 +60,6 @@ class LidarQuality:
     Attributes:
         width_m, height_m: of the plate as measured.
         width_sigma_m, height_sigma_m: standard deviation of these.
-        size_ratio: both sides together over the nominal ones.
         n_rings, n_points: on the plate.
         n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
         n_ring_ends_dropped: that do not fit the outline.
@@ -78,15 +68,12 @@ class LidarQuality:
         template_m: error of the nominal outline.
         beyond_share: returns in the plane beyond the outline over those on the plate.
         distance_m: of the plate's middle.
-        incidence_deg: between the beam and the plate's normal there.
-        range_noise_m: of the whole scan.
     """
 
     width_m: float
     height_m: float
     width_sigma_m: float
     height_sigma_m: float
-    size_ratio: float
     n_rings: int
     n_points: int
     n_ring_ends: int
@@ -96,8 +83,6 @@ class LidarQuality:
     template_m: float
     beyond_share: float
     distance_m: float
-    incidence_deg: float
-    range_noise_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +120,6 @@ class ImageBoard:
     track_ns: NDArray[np.int64] | None = None
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
-
-    @property
-    def is_ambiguous(self) -> bool:
-        """Whether the image alone cannot decide between the two poses."""
-        return self.chi2_gap < _AMBIGUOUS_CHI2
 
     @property
     def distance_m(self) -> float:

@@ -169,7 +169,6 @@ def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
         height_m=height_m,
         width_sigma_m=sigma_m,
         height_sigma_m=sigma_m,
-        size_ratio=1.0,
         n_rings=n_rings,
         n_points=len(points),
         n_ring_ends=2 * n_rings,
@@ -179,8 +178,6 @@ def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
         template_m=0.01,
         beyond_share=0.0,
         distance_m=2.0,
-        incidence_deg=10.0,
-        range_noise_m=0.01,
     )
 
 

@@ -50,7 +50,7 @@ def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
     document = json.loads(lce_rig("check", moving, "--json").out)
     (pair,) = [pair for pair in document["pairs"] if pair["channel"] == "events"]
     for capture in pair["captures"].values():
-        names = {"events_px_s", "events_px", "speed_mps", "turn_deg_s", "smear_m", "smear_depth_m"}
+        names = {"events_px_s", "events_px", "speed_mps", "turn_deg_s", "smear_m"}
         assert names <= capture["image"].keys()
         assert 0 < capture["image"]["smear_m"] < 0.01
 

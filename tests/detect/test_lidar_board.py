@@ -25,6 +25,7 @@ from lce_rig.core.geometry import exp_so3, invert, pose, transform
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board
+from lce_rig.detect.lidar.segments import order_scan
 
 POINT_BEAM = Beam(0.0, 0.0)
 ROOM = room(13.0)
@@ -120,12 +121,13 @@ def test_board_whose_dark_squares_return_nothing_or_from_too_far_is_found_where_
 @pytest.mark.parametrize("sigma_m", [0.0, 0.016, 0.032, 0.048, 0.06, 0.08, 0.1])
 def test_board_is_found_at_every_noise_level_of_the_paper(sigma_m):
     T = place(2.3, 15, 45, 20, 10)
-    found = find(cast([board_plate(T), *ROOM], sigma_m=sigma_m, seed=2))
+    scan = cast([board_plate(T), *ROOM], sigma_m=sigma_m, seed=2)
+    found = find(scan)
     # 600 returns spread by 0.18 m rms fix a normal to sigma / (0.18 sqrt(600)) an axis; five times that.
     assert_is_board(
         found, T, within_m=0.03, within_deg=3, normal_deg=0.1 + 5 * np.degrees(sigma_m / 0.18 / 24)
     )
-    assert found[0].quality.range_noise_m == pytest.approx(max(sigma_m, 0.004), rel=0.1)
+    assert order_scan(scan, 0.4).sigma_m == pytest.approx(max(sigma_m, 0.004), rel=0.1)
 
 
 @pytest.mark.parametrize("behind_m", [0.1, 0.2, 0.4])
@@ -221,8 +223,9 @@ def test_normal_edges_and_size_are_unbiased_over_many_boards():
 @pytest.mark.parametrize("scale", [0.95, 1.03, 1.08])
 def test_board_of_another_size_is_measured_not_cut_to_size(scale):
     T = place(2.3, 30)
-    board = find(cast([board_plate(T, scale=scale), *ROOM], sigma_m=0.01))[0]
-    assert board.quality.size_ratio == pytest.approx(scale, abs=0.007)
+    quality = find(cast([board_plate(T, scale=scale), *ROOM], sigma_m=0.01))[0].quality
+    area_m2 = quality.width_m * quality.height_m
+    assert np.sqrt(area_m2 / (BOARD.width_m * BOARD.height_m)) == pytest.approx(scale, abs=0.01)
 
 
 def test_damaged_points_change_nothing():

@@ -140,16 +140,13 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
     if motion is None:
         return measured
     speed_mps = float(np.linalg.norm(motion.velocity_mps))
-    along_normal_mps = abs(float(motion.velocity_mps @ found.T_cam_board[:3, 2]))
-    swept_s = math.nan if sweep_s is None else sweep_s
     return replace(
         measured,
         speed_mps=speed_mps,
         speed_sigma_mps=motion.speed_sigma_mps,
         turn_deg_s=float(np.degrees(np.linalg.norm(motion.turn_rad_s))),
         turn_sigma_deg_s=float(np.degrees(motion.turn_sigma_rad_s)),
-        smear_m=speed_mps * swept_s,
-        smear_depth_m=along_normal_mps * swept_s,
+        smear_m=math.nan if sweep_s is None else speed_mps * sweep_s,
     )
 
 

@@ -47,9 +47,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
     contrast = float(abs(np.median(alternating[is_seen])))
     to_border = np.nanmin(np.minimum(grid, [width - 1, height - 1] - grid))
     return ImageQuality(
-        mean_grey=float(grey.mean()),
         contrast=contrast,
-        noise=float(np.median(crossings.misfit[is_seen])),
         square_px=square_px,
         edge_width_px=edge_width_px,
         sharpness=square_px / edge_width_px if edge_width_px > 0 else 0.0,

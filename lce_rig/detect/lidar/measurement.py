@@ -312,16 +312,13 @@ def build_board(
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     rms_m = float(np.sqrt(np.mean(height**2)))
-    incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
     # The effective size of the light spot is unknown.
     size_m, sigma_m = 2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m)
-    weight = 1.0 / sigma_m**2
     quality = LidarQuality(
         width_m=float(size_m[0]),
         height_m=float(size_m[1]),
         width_sigma_m=float(sigma_m[0]),
         height_sigma_m=float(sigma_m[1]),
-        size_ratio=float((weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum()),
         n_rings=1 + int(np.count_nonzero(np.diff(scan.ring[kept]))),
         n_points=len(kept),
         n_ring_ends=len(edge),
@@ -331,8 +328,6 @@ def build_board(
         template_m=placement.error_m,
         beyond_share=float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
         distance_m=distance_m,
-        incidence_deg=float(np.degrees(incidence)),
-        range_noise_m=scan.sigma_m,
     )
     # The share of the power that comes from behind where a beam meets it and the board alike. Intensities
     # are those of surfaces; the power received falls with the square of the range.

@@ -432,7 +432,6 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         height_m=float(size_m[1]),
         width_sigma_m=float(sigma_m[0]),
         height_sigma_m=float(sigma_m[1]),
-        size_ratio=float(np.mean(size_m / [board.width_m, board.height_m])),
         n_rings=0,
         n_points=n_on,
         n_ring_ends=int(np.count_nonzero(is_good)),
@@ -442,8 +441,6 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         template_m=edge_rms_m,
         beyond_share=beyond,
         distance_m=distance_m,
-        incidence_deg=float(np.degrees(np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0)))),
-        range_noise_m=rms_m,
     )
     beam_m = view.beam_parts_m(strips.outwards, strips.uv)
     inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
