@@ -57,8 +57,8 @@ class TriggerMatcher:
     """Pulses and images of one camera in, matched images out, each stream in its own order.
 
     Attributes:
-        counts: n_matched images, n_unmatched, n_lost_frames and n_repeated ones; n_restarts of either count,
-            or of the search for the constant.
+        counts: n_matched images and n_unmatched ones; n_restarts of either count, or of the search for the
+            constant.
         problem: why images are not matched now; None while they are.
     """
 
@@ -93,7 +93,6 @@ class TriggerMatcher:
         last_count, last_ns = next(reversed(self._pulses.items()), (pulse.count - 1, 0))
         if pulse.count <= last_count:
             if self._pulses.get(pulse.count) == pulse.stamp_ns:
-                self.counts["n_repeated"] += 1
                 return []
             self._restart(findings.BOARD_RESTARTED)
             self._pulses.clear()
@@ -116,11 +115,8 @@ class TriggerMatcher:
             return []
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
-                self.counts["n_repeated"] += 1
                 return []
             self._restart(findings.CAMERA_RESTARTED)
-        elif self._last is not None:
-            self.counts["n_lost_frames"] += image.count - self._last[0] - 1
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()
