@@ -9,7 +9,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
+from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle
 from lce_rig.core.planar_pose import pose_covariance
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import (
@@ -24,82 +24,27 @@ from lce_rig.detect.finder import gate_image_board
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.rig import QualitySettings
 
-# One order of corners, and one of the two poses, for all images of the same board.
-
-
-def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -> ImageBoard:
-    """Order the corners from the same end of the pattern as in another image of about the same time.
-
-    The pattern looks the same when rotated by 180 deg, a square one by 90 deg, except for the colours of
-    its squares, and a reconstruction can have those wrong. The turn that brings the two poses nearest to each
-    other is taken; the board must not have rotated by half of that between the images.
-
-    Args:
-        found: the board whose corners are put in order.
-        reference: the board as another image of the camera shows it; of frames and events, the frame.
-        board: the board.
-
-    Returns:
-        `found` unchanged, or with corners, poses, covariances and track rotated.
-    """
-    if board.has_markers:
-        return found
-    turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
-    R_reference = reference.T_cam_board[:3, :3]
-    angles = [
-        float(rotation_angle((found.T_cam_board @ _turn(board, k))[:3, :3], R_reference)) for k in turns
-    ]
-    best = turns[int(np.argmin(angles))]
-    return found if best == 0 else _turned(found, board, best)
-
 
 def nearest_pose(
     found: ImageBoard, T_near: Array, board: Board, intrinsics: Intrinsics
 ) -> tuple[Array, Array]:
-    """Choose the one of the two poses that is turned least against T_near (4, 4).
+    """Choose the pose turned least against T_near (4, 4) of those that an image admits.
+
+    An image admits two poses. Without markers, the pattern looks the same when rotated by 180 deg, a square
+    one by 90 deg, except for the colours of its squares, which a reconstruction can have wrong: all such
+    turns of both poses are compared. The board must not rotate by half of that between the images.
 
     Returns:
         T_cam_board (4, 4) and its covariance (6, 6).
     """
-    other = found.T_cam_board_alternative
-    if other is None:
-        return found.T_cam_board, found.cov
-    poses = np.stack([found.T_cam_board, other])
-    if int(np.argmin(rotation_angle(poses[:, :3, :3], T_near[:3, :3]))) == 0:
-        return found.T_cam_board, found.cov
-    return other, pose_covariance(other, board.corners(), intrinsics, found.sigma_px)
-
-
-def _turn(board: Board, n_quarters: int) -> Array:
-    """Build the motion (4, 4) of the board that `numpy.rot90` of its corners amounts to."""
-    R = exp_so3(np.array([0.0, 0.0, -n_quarters * np.pi / 2]))
+    step = 4 if board.has_markers else 1 if board.rows == board.cols else 2
+    turns = [exp_so3(np.array([0.0, 0.0, k * np.pi / 2])) for k in range(0, 4, step)]
     centre = np.array([*board.pattern_offset_m, 0.0])
-    return pose(R, centre - R @ centre)
-
-
-def _turned(found: ImageBoard, board: Board, n_quarters: int) -> ImageBoard:
-    F = _turn(board, n_quarters)
-    grid = found.corners_px.reshape(board.rows, board.cols, 2)
-    other, track = found.T_cam_board_alternative, found.track_T_cam_board
-    track_cov = found.track_cov
-    if track is not None and track_cov is not None:
-        track_cov = _turned_cov(track, track_cov, F)
-    return replace(
-        found,
-        corners_px=np.ascontiguousarray(np.rot90(grid, n_quarters).reshape(-1, 2)),
-        T_cam_board=found.T_cam_board @ F,
-        cov=_turned_cov(found.T_cam_board, found.cov, F),
-        T_cam_board_alternative=None if other is None else other @ F,
-        track_T_cam_board=None if track is None else track @ F,
-        track_cov=track_cov,
-    )
-
-
-def _turned_cov(T: Array, cov: Array, F: Array) -> Array:
-    """Move covariances (..., 6, 6) from T to T F: the new origin is R f + t, with d(R f) = phi x R f."""
-    A = np.broadcast_to(np.eye(6), cov.shape).copy()
-    A[..., :3, 3:] = -skew(T[..., :3, :3] @ F[:3, 3])
-    return np.asarray(A @ cov @ np.swapaxes(A, -1, -2))
+    poses = [T for T in (found.T_cam_board, found.T_cam_board_alternative) if T is not None]
+    candidates = np.stack([T @ pose(R, centre - R @ centre) for T in poses for R in turns])
+    T = candidates[int(np.argmin(rotation_angle(candidates[:, :3, :3], T_near[:3, :3])))]
+    is_seen = np.isfinite(found.corners_px).all(axis=1)
+    return T, pose_covariance(T, board.corners()[is_seen], intrinsics, found.sigma_px)
 
 
 #: When the board is looked for besides the main picture, ns after it.
@@ -183,7 +128,6 @@ def _followed(
             seen = find_image_board(other, board, intrinsics, last=last, limits=limits, is_from_events=True)
             if isinstance(seen, Refusal):
                 continue
-            seen = align_corner_order(seen, main, board)
             T, cov = nearest_pose(seen, main.T_cam_board, board, intrinsics)
             if rotation_angle(T[:3, :3], main.T_cam_board[:3, :3]) < _MAX_TURN_RAD:
                 track[stamp], last = (T, cov), seen
