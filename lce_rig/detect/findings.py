@@ -12,7 +12,6 @@ _WHOLE = "show the whole pattern; correct board.inner_corners (squares less one)
 _UNCOVER = "uncover the pattern, come closer, or correct board.inner_corners"
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "flatten the board, or `lce-rig intrinsics {session} --save-profile FILE`"
-_CLOCKS = "check that both sensors' clocks agree"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
 
 
@@ -42,18 +41,15 @@ READ_NETWORK_SETTLING = Kind(
     "{n_steps} windows of events ({seen_s:.2f} s) precede the image, the network needs {n_warm_up}",
     "keep the board or the camera moving for a second before the first capture",
 )
-READ_BEFORE_EVENTS = Kind(
-    "read.before_events",
-    "the image is {gap_s:.3f} s before the first event",
-    _CLOCKS + ", or start the event camera first",
-)
-READ_AFTER_EVENTS = Kind(
-    "read.after_events",
-    "the image is {gap_s:.3f} s after the last event",
-    _CLOCKS + ", or record events to the end",
+READ_OUTSIDE_EVENTS = Kind(
+    "read.outside_events",
+    "the image is {gap_s:.3f} s before the first event or after the last one",
+    "check that both sensors' clocks agree; record events from before the first image to after the last",
 )
 READ_NO_EVENTS = Kind(
-    "read.no_events", "the recording holds no events", "check the events' topic and the camera"
+    "read.no_events",
+    "there are no events",
+    "uncover the lens, switch the event stream on, check the events' topic",
 )
 IMAGE_NOT_AT_FIRST_SIGHT = Kind(
     "image.not_at_first_sight", "no board found by the quick search", "search the image thoroughly"
@@ -158,14 +154,6 @@ IMAGE_TILTED = Kind(
     "tilt {tilt_deg:.0f} deg (limit {max_tilt_deg:g} deg)",
     "turn the board {turn_deg:.0f} deg towards the camera",
 )
-IMAGE_NO_EVENTS = Kind(
-    "image.no_events", "the capture holds no events", "uncover the lens, switch the event stream on"
-)
-IMAGE_FEW_EVENTS = Kind(
-    "image.few_events",
-    "too few events: {n_events} in the second before the image",
-    "move the board sideways, about 10 cm/s, or uncover the lens",
-)
 IMAGE_FLICKER = Kind(
     "image.flicker",
     "most events come from light that flickers",
@@ -179,7 +167,7 @@ IMAGE_HOT_PIXELS = Kind(
 IMAGE_HARDLY_MOVED = Kind(
     "image.hardly_moved",
     "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
-    MOVE_SLOWLY,
+    MOVE_SLOWLY + "; uncover the lens",
 )
 IMAGE_TOO_FAST = Kind(
     "image.too_fast",

@@ -19,7 +19,7 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair, from_arrays, to_arrays
 from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
-from lce_rig.detect.events.search import EventSighting, find_event_board
+from lce_rig.detect.events.search import find_event_board
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
@@ -178,10 +178,10 @@ class _Finder:
         """Find the board in raw events, and keep the reconstructed image."""
 
         def find() -> ImageDetection:
-            sighting = self._see(capture, camera, channel, scans)
+            picture, board = self._see(capture, camera, channel, scans)
             key = _cache_key(self._event_digest, capture, f"{camera}.{channel}.picture")
-            self._keep(key, sighting.picture)
-            return sighting.board
+            self._keep(key, picture)
+            return board
 
         return self._remembered(self._event_digest, capture, f"{camera}.{channel}", find)
 
@@ -191,13 +191,13 @@ class _Finder:
         """Return the image reconstructed from raw events."""
 
         def find() -> Image | Refusal:
-            return self._see(capture, camera, channel, scans).picture
+            return self._see(capture, camera, channel, scans)[0]
 
         return self._remembered(self._event_digest, capture, f"{camera}.{channel}.picture", find)
 
     def _see(
         self, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
-    ) -> EventSighting:
+    ) -> tuple[Image | Refusal, ImageDetection]:
         """Reconstruct an image of a capture's events for the LiDAR's time of the board, and find it there."""
         from lce_rig.detect.events.figures import sweep_time_s
 

@@ -104,7 +104,7 @@ def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_p
     assert distance_m < 0.03 and angle_rad < np.radians(3)
     # What was kept is enough to see the board again, from a cold start.
     rig = session.rig
-    seen = find_event_board(
+    _, board = find_event_board(
         capture.events("davis"),
         middle_ns,
         Reconstructor(),
@@ -112,7 +112,7 @@ def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_p
         rig.cameras["davis"].to_intrinsics(),
         rig.quality,
     )
-    assert isinstance(seen.board, ImageBoard) and off_truth(seen.board.T_cam_board, middle_ns)[0] < 0.03
+    assert isinstance(board, ImageBoard) and off_truth(board.T_cam_board, middle_ns)[0] < 0.03
 
 
 def _with_hot_pixels(packets):

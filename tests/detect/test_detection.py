@@ -41,7 +41,7 @@ def test_arrays_that_are_no_detection_are_refused():
 
 
 def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
-    refusal = Refusal("image.no_events")
+    refusal = Refusal("image.flat")
     images = {
         ("cam", "frames"): {"000000": refusal, "000001": refusal},
         ("cam", "events"): {"000002": refusal},

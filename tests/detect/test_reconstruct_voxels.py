@@ -43,7 +43,7 @@ def test_the_grid_equals_the_sum_over_events_of_its_definition(n, seed, n_bins):
 
 
 def test_normalised_grids_have_mean_0_and_deviation_1_over_what_was_hit():
-    grid = voxel_grid(random_events(200, 1))
+    grid = voxel_grid(random_events(200, 1), 5, 0, 50_000_000)
     is_hit = grid != 0
     normalised = normalise_voxels(grid.copy())
     assert normalised[is_hit].mean() == pytest.approx(0, abs=1e-5)
@@ -54,7 +54,7 @@ def test_normalised_grids_have_mean_0_and_deviation_1_over_what_was_hit():
 
 def test_a_hot_pixel_is_told_from_an_edge():
     rng = np.random.default_rng(3)
-    counts = rng.poisson(2, (40, 50)).astype(np.uint16)
+    counts = rng.poisson(2, (40, 50))
     counts[:, 20:23] += 60  # an edge that went to and fro
     counts[10, 40] = counts[10, 41] = 900
     is_hot = hot_pixels(counts)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -13,13 +12,17 @@ from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import EventQuality, ImageBoard, LidarBoard
-from lce_rig.detect.events.windows import hot_pixels, is_flickering
+from lce_rig.detect.events.windows import (
+    BLOCK_PX,
+    events_per_block,
+    events_per_pixel,
+    hot_pixels,
+    is_flickering,
+)
 from lce_rig.detect.findings import (
-    IMAGE_FEW_EVENTS,
     IMAGE_FLICKER,
     IMAGE_HARDLY_MOVED,
     IMAGE_HOT_PIXELS,
-    IMAGE_NO_EVENTS,
     IMAGE_SMEARED,
     IMAGE_TOO_FAST,
     IMAGE_TURNING,
@@ -29,28 +32,12 @@ from lce_rig.rig import QualitySettings
 #: Events older than this no longer show in the network's image.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
-_BLOCK_PX = 16
 # A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
 # Poses nearer in time than this do not determine a speed.
 _MIN_TRACK_S = 0.03
 _ALONG = np.linspace(0, 1, 24)[:, None]
-
-
-class BoardMotion(NamedTuple):
-    """How the board moves about the time of its main image.
-
-    Attributes:
-        velocity_mps: (3,) of the board's middle, frame camera.
-        turn_rad_s: (3,) frame camera.
-        speed_sigma_mps, turn_sigma_rad_s: standard deviation of the two along themselves.
-    """
-
-    velocity_mps: Array
-    turn_rad_s: Array
-    speed_sigma_mps: float
-    turn_sigma_rad_s: float
 
 
 def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Array:
@@ -85,34 +72,6 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
     return EventQuality(n_recent / n_pixels / (1e-9 * _JUST_NS), n_remembered / n_pixels)
 
 
-def busiest_events(events: Events, stamp_ns: int) -> float:
-    """Count the events a pixel in the time that the network remembers, where most of them are.
-
-    Of an image in which no board was found: blocks of pixels together as large as a board, busiest first.
-    """
-    recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
-    n_cols, n_rows = -(-events.width_px // _BLOCK_PX), -(-events.height_px // _BLOCK_PX)
-    block = (recent.y // _BLOCK_PX).astype(np.intp) * n_cols + recent.x // _BLOCK_PX
-    counts = np.sort(np.bincount(block, minlength=n_cols * n_rows))[::-1]
-    busiest = counts[: max(1, round(_BUSY_SHARE * len(counts)))]
-    return float(busiest.mean()) / _BLOCK_PX**2
-
-
-def board_motion(found: ImageBoard) -> BoardMotion | None:
-    """Fit a constant velocity to the poses of a tracked board; None if it was not tracked."""
-    track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
-    if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
-        return None
-    time_s = np.append(0.0, 1e-9 * (track_ns - found.stamp_ns))
-    if np.ptp(time_s) < _MIN_TRACK_S:
-        return None
-    moved = np.concatenate([np.zeros((1, 6)), difference(track, found.T_cam_board)])
-    cov = np.concatenate([found.cov[None], track_cov])
-    velocity, cov_velocity = _slope(time_s, moved[:, :3], cov[:, :3, :3])
-    turn, cov_turn = _slope(time_s, moved[:, 3:], cov[:, 3:, 3:])
-    return BoardMotion(velocity, turn, _sigma_along(velocity, cov_velocity), _sigma_along(turn, cov_turn))
-
-
 def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
     """Measure how long a LiDAR takes from its first to its last return from the board.
 
@@ -129,48 +88,48 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
 
 
 def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None) -> EventQuality:
-    """Add figures of the board's motion; none without a track.
+    """Add the constant velocity fitted to the poses of a tracked board; nothing without a track.
+
+    All poses have equal weights. With weights by covariance, in which depth and lateral position are
+    correlated, a hand's lateral deviation from the line would appear as speed along the line of sight.
 
     Args:
         measured: figures of the board's events.
         found: with its track.
         sweep_s: how long the LiDAR sees the board; None if it does not.
     """
-    motion = board_motion(found)
-    if motion is None:
+    track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
+    if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
         return measured
-    speed_mps = float(np.linalg.norm(motion.velocity_mps))
+    time_s = np.append(0.0, 1e-9 * (track_ns - found.stamp_ns))
+    if np.ptp(time_s) < _MIN_TRACK_S:
+        return measured
+    since_s = time_s - time_s.mean()
+    share = since_s / np.sum(since_s**2)
+    # By time, of the pose's tangent: translation in m, rotation in rad.
+    velocity = share[1:] @ difference(track, found.T_cam_board)
+    cov = np.einsum("k,kij->ij", share**2, np.concatenate([found.cov[None], track_cov]))
+    speed_mps, speed_sigma_mps = _length(velocity[:3], cov[:3, :3])
+    turn_rad_s, turn_sigma_rad_s = _length(velocity[3:], cov[3:, 3:])
     return replace(
         measured,
         speed_mps=speed_mps,
-        speed_sigma_mps=motion.speed_sigma_mps,
-        turn_deg_s=float(np.degrees(np.linalg.norm(motion.turn_rad_s))),
-        turn_sigma_deg_s=float(np.degrees(motion.turn_sigma_rad_s)),
+        speed_sigma_mps=speed_sigma_mps,
+        turn_deg_s=float(np.degrees(turn_rad_s)),
+        turn_sigma_deg_s=float(np.degrees(turn_sigma_rad_s)),
         smear_m=math.nan if sweep_s is None else speed_mps * sweep_s,
     )
 
 
-def _slope(time_s: Array, values: Array, cov: Array) -> tuple[Array, Array]:
-    """Fit values (K, 3) = a + b t; return b (3,) and its covariance (3, 3).
-
-    All have equal weights. With weights by covariance, in which depth and lateral position are correlated, a
-    hand's lateral deviation from the line would appear as speed along the line of sight.
-    """
-    since_s = time_s - time_s.mean()
-    share = since_s / np.sum(since_s**2)
-    return share @ values, np.einsum("k,kij->ij", share**2, cov)
-
-
-def _sigma_along(vector: Array, cov: Array) -> float:
+def _length(vector: Array, cov: Array) -> tuple[float, float]:
+    """Compute the length of a vector (3,) and its standard deviation along itself."""
     length = float(np.linalg.norm(vector))
     if length == 0:
-        return float(np.sqrt(np.trace(cov)))
-    return float(np.sqrt(vector @ cov @ vector)) / length
+        return 0.0, float(np.sqrt(np.trace(cov)))
+    return length, float(np.sqrt(vector @ cov @ vector)) / length
 
 
 _MAX_HOT_SHARE = 0.5
-# One event per hundred pixels in 1 s counts as none.
-_MIN_EVENTS_PX = 0.01
 # Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
 _SLOW_EVENTS_PX = 4.0
 
@@ -214,25 +173,20 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
     """
-    if not len(events):
-        return IMAGE_NO_EVENTS.refusal()
     if seen.stage == "read":
         return seen
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
-    n_pixels = events.width_px * events.height_px
-    if len(recent) < _MIN_EVENTS_PX * n_pixels:
-        return IMAGE_FEW_EVENTS.refusal(n_events=len(recent))
     if is_flickering(recent):
         return IMAGE_FLICKER.refusal()
-    # Count hot pixels and measure their share of the events.
-    shape = recent.height_px, recent.width_px
-    index = recent.y.astype(np.intp) * recent.width_px + recent.x
-    counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
-    is_hot = hot_pixels(np.minimum(counts, 65535).astype(np.uint16))
+    counts = events_per_pixel(recent)
+    is_hot = hot_pixels(counts)
     n_hot, hot_share = int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))
     if hot_share > _MAX_HOT_SHARE:
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
-    events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
+    # Blocks of pixels together as large as a board, busiest first.
+    of_blocks = np.sort(events_per_block(recent))[::-1]
+    busiest = of_blocks[: max(1, round(_BUSY_SHARE * len(of_blocks)))]
+    events_px, needed_px = float(busiest.mean()) / BLOCK_PX**2, max(_SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
         return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=needed_px)
     return seen

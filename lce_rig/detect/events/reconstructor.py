@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +23,14 @@ from lce_rig.detect.events.windows import (
     window_rule,
 )
 from lce_rig.detect.findings import (
-    READ_AFTER_EVENTS,
-    READ_BEFORE_EVENTS,
     READ_NETWORK_SETTLING,
     READ_NO_EVENTS,
+    READ_OUTSIDE_EVENTS,
 )
 
 States = tuple[FloatArray, ...]
 
 SHIPPED_NETWORK = Path(__file__).parents[2] / "models" / "reconstruction.onnx"
-
-
-class StateSpec(NamedTuple):
-    """A recurrent state's channels and its size as a fraction of the image's: 2 is half."""
-
-    n_channels: int
-    divisor: int
 
 
 class ReconstructionModel:
@@ -67,18 +58,16 @@ class ReconstructionModel:
         voxels, *states = self._session.get_inputs()
         # (1, bins, "height", "width"), and (1, channels, "height_2", "width_2") of a state at half size.
         self.n_bins = int(voxels.shape[1])
-        self.states = tuple(
-            StateSpec(int(state.shape[1]), int(state.shape[2].partition("_")[2] or 1)) for state in states
-        )
+        self._states = [(int(each.shape[1]), int(each.shape[2].partition("_")[2])) for each in states]
         # The image is padded so that every state has a whole number of rows and columns.
-        self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
+        self._multiple = math.lcm(*(divisor for _, divisor in self._states))
 
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Make the states before the first window for a sensor of this size: zeros."""
         height, width = self._padded(height_px), self._padded(width_px)
         return tuple(
-            np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
-            for spec in self.states
+            np.zeros((1, n_channels, height // divisor, width // divisor), np.float32)
+            for n_channels, divisor in self._states
         )
 
     def step(self, voxels: FloatArray, states: States) -> tuple[FloatArray, States]:
@@ -100,7 +89,7 @@ class ReconstructionModel:
         return image[0, 0, :height, :width], tuple(following)
 
     def _padded(self, size_px: int) -> int:
-        return -(-size_px // self.size_multiple) * self.size_multiple
+        return -(-size_px // self._multiple) * self._multiple
 
 
 # From the network's arbitrary scale to 8 bits, without flicker.
@@ -212,7 +201,7 @@ class Reconstructor:
             if late_ns <= _MAX_AFTER_END_NS:
                 yield self.picture_at(stamp_ns)
             else:
-                yield READ_AFTER_EVENTS.refusal(gap_s=1e-9 * late_ns)
+                yield READ_OUTSIDE_EVENTS.refusal(gap_s=1e-9 * late_ns)
 
     def feed(self, events: Events) -> None:
         """Take the next events of a stream that runs on; `picture_at` gives its images.
@@ -237,7 +226,7 @@ class Reconstructor:
         if self._first_ns is None:
             return READ_NO_EVENTS.refusal()
         if stamp_ns <= self._first_ns:
-            return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
+            return READ_OUTSIDE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
         self._advance(stamp_ns)
         if self.n_steps < N_WARM_UP:
             seen_s = 1e-9 * (stamp_ns - self._first_ns)

@@ -1,7 +1,7 @@
 """The board in a stream of events: detected in an image at the requested time, and tracked through others."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,19 +53,6 @@ TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
 _MAX_TURN_RAD = np.radians(45)
 
 
-@dataclass(frozen=True, eq=False)
-class EventSighting:
-    """The detection in a stream of events.
-
-    Attributes:
-        picture: at the time asked for, or why there is none.
-        board: in that image and, as its track, in those about it; or why it is not there.
-    """
-
-    picture: Image | Refusal
-    board: ImageBoard | Refusal
-
-
 def find_event_board(
     events: Events,
     stamp_ns: int,
@@ -75,7 +62,7 @@ def find_event_board(
     limits: QualitySettings,
     *,
     sweep_s: float | None = None,
-) -> EventSighting:
+) -> tuple[Image | Refusal, ImageBoard | Refusal]:
     """Make an image of the events up to a timestamp, find the board in it and follow it to either side.
 
     Args:
@@ -87,6 +74,9 @@ def find_event_board(
         limits: `quality` of the rig profile.
         sweep_s: how long the LiDAR sees the board; None if it does not.
 
+    Returns:
+        The image at that time, and the board in it with its track in those about it; or why there are none.
+
     Raises:
         ProfileError: the intrinsics are for images of another size.
     """
@@ -96,14 +86,14 @@ def find_event_board(
     pictures = dict(zip(stamps, reconstructor.reconstruct([events], stamps), strict=True))
     picture = pictures.pop(stamp_ns)
     if isinstance(picture, Refusal):
-        return EventSighting(picture, explain_missing_board(events, stamp_ns, picture, limits))
+        return picture, explain_missing_board(events, stamp_ns, picture, limits)
     found = find_image_board(picture, board, intrinsics, limits=limits, is_from_events=True)
     if isinstance(found, Refusal):
-        return EventSighting(picture, explain_missing_board(events, stamp_ns, found, limits))
+        return picture, explain_missing_board(events, stamp_ns, found, limits)
     found = _followed(replace(found, stamp_ns=stamp_ns), pictures, board, intrinsics, limits)
     made = event_quality(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
     gated = gate_image_board(replace(found, events=with_motion(made, found, sweep_s)), limits)
-    return EventSighting(picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated)
+    return picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated
 
 
 def _followed(

@@ -10,7 +10,7 @@ from lce_rig.core.data import Events
 
 # What the network was trained on, and E2VID's habit: about 0.35 events per pixel a step.
 _EVENTS_PER_PIXEL = 0.35
-_BLOCK_PX = 16
+BLOCK_PX = 16
 # Share of the sensor that takes part in a usual scene with the camera moving; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
@@ -57,25 +57,34 @@ def active_share(events: Events) -> float:
     """
     if not len(events):
         return 1.0
-    n_cols = -(-events.width_px // _BLOCK_PX)
-    n_rows = -(-events.height_px // _BLOCK_PX)
-    block = (events.y // _BLOCK_PX).astype(np.intp) * n_cols + events.x // _BLOCK_PX
-    counts = np.bincount(block, minlength=n_rows * n_cols).astype(np.float64)
+    counts = events_per_block(events)
     return float(counts.sum() ** 2 / (len(counts) * np.square(counts).sum()))
+
+
+def events_per_block(events: Events) -> NDArray[np.float64]:
+    """Count the events of each block of 16 x 16 pixels (B,)."""
+    n_cols, n_rows = -(-events.width_px // BLOCK_PX), -(-events.height_px // BLOCK_PX)
+    block = (events.y // BLOCK_PX).astype(np.intp) * n_cols + events.x // BLOCK_PX
+    return np.bincount(block, minlength=n_cols * n_rows).astype(np.float64)
+
+
+def events_per_pixel(events: Events) -> NDArray[np.int64]:
+    """Count the events of each pixel (H, W)."""
+    index = events.y.astype(np.intp) * events.width_px + events.x
+    counts = np.bincount(index, minlength=events.height_px * events.width_px)
+    return counts.reshape(events.height_px, events.width_px)
 
 
 FloatArray = NDArray[np.float32]
 
 
-def voxel_grid(
-    events: Events, n_bins: int = 5, start_ns: int | None = None, end_ns: int | None = None
-) -> FloatArray:
+def voxel_grid(events: Events, n_bins: int, start_ns: int, end_ns: int) -> FloatArray:
     """Spread events over temporal bins, V(b) = sum p max(0, 1 - |b - t*|), t* = (B - 1) (t - t0) / dt [1].
 
     Args:
         events: N events.
         n_bins: B.
-        start_ns, end_ns: t0 and t0 + dt; None takes the first and the last event's timestamp.
+        start_ns, end_ns: t0 and t0 + dt.
 
     Returns:
         (B, H, W) float32, polarity +-1.
@@ -86,8 +95,6 @@ def voxel_grid(
     shape = (n_bins, events.height_px, events.width_px)
     if not len(events):
         return np.zeros(shape, np.float32)
-    start_ns = int(events.t_ns[0]) if start_ns is None else start_ns
-    end_ns = int(events.t_ns[-1]) if end_ns is None else end_ns
     duration_ns = max(1, end_ns - start_ns)
     position = np.clip((events.t_ns - start_ns) * ((n_bins - 1) / duration_ns), 0.0, n_bins - 1)
     sign = np.where(events.polarity, 1.0, -1.0)
@@ -137,14 +144,13 @@ class NoiseFilter:
         """Count the next stretch of the stream; twice a second the hot pixels are determined again."""
         if not len(events):
             return
-        shape = events.height_px, events.width_px
         if self._n_events is None:
-            self._n_events, self._since_ns = np.zeros(shape, np.int64), int(events.t_ns[0])
-        index = events.y.astype(np.intp) * events.width_px + events.x
-        self._n_events += np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+            self._n_events = np.zeros((events.height_px, events.width_px), np.int64)
+            self._since_ns = int(events.t_ns[0])
+        self._n_events += events_per_pixel(events)
         last_ns = int(events.t_ns[-1])
         if last_ns - self._since_ns >= _HOT_PERIOD_NS:
-            self._is_hot = hot_pixels(np.minimum(self._n_events, 65535).astype(np.uint16))
+            self._is_hot = hot_pixels(self._n_events)
             self._n_events[:] = 0
             self._since_ns = last_ns
 
@@ -155,7 +161,7 @@ class NoiseFilter:
         return without_background_activity(events)
 
 
-def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def hot_pixels(n_events: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Find pixels that fire on their own, (H, W), from events per pixel over half a second or more, (H, W).
 
     Real edges pass over neighbours too, whichever way they move; a hot pixel's neighbours stay quiet. The
@@ -163,8 +169,9 @@ def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:
     """
     import cv2
 
-    typical = cv2.medianBlur(n_events, 5).astype(np.float32)
-    return np.asarray((n_events >= _HOT_MIN_EVENTS) & (n_events > _HOT_FACTOR * (typical + 1)))
+    counts = np.minimum(n_events, 65535).astype(np.uint16)
+    typical = cv2.medianBlur(counts, 5).astype(np.float32)
+    return np.asarray((counts >= _HOT_MIN_EVENTS) & (counts > _HOT_FACTOR * (typical + 1)))
 
 
 def without_background_activity(events: Events) -> Events:
