@@ -100,7 +100,6 @@ def export(
             output,
             formats=formats,
             is_forced=force,
-            session=opened,
             robot=robot,
             findings=findings,
         )

@@ -45,8 +45,6 @@ OutputFormat = Literal[
     "fast_livo2",
     "koide3",
     "opencv",
-    "mcap",
-    "ply",
 ]
 
 SWAPPED_SIDES = Kind(
