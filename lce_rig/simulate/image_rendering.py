@@ -169,7 +169,7 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
 
 @lru_cache(maxsize=8)
 def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
-    """Compute by what radiance is multiplied on its way to each pixel (H, W): exposure and vignetting.
+    """Compute by what radiance is multiplied on its way to each pixel (H, W): vignetting.
 
     It is the same for all images of a camera and read-only.
     """
@@ -177,7 +177,7 @@ def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
     radius2 = ((u - (width_px - 1) / 2) ** 2 + (v - (height_px - 1) / 2) ** 2) / (
         ((width_px - 1) ** 2 + (height_px - 1) ** 2) / 4
     )
-    gain = np.asarray(noise.exposure * (1 - noise.vignetting * radius2))
+    gain = np.asarray(1 - noise.vignetting * radius2)
     gain.setflags(write=False)
     return gain
 

@@ -1,7 +1,7 @@
 """Options of a simulated rig; defaults come from data sheets and real recordings."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -88,14 +88,12 @@ class CameraNoise:
         blur_px: sigma of the lens's point spread.
         full_well_e: electrons at full scale; sets the shot noise.
         read_noise_e: electrons of noise in the dark.
-        exposure: brightness; 1 shows the white of a well-lit board a little below full scale.
         vignetting: loss of light at the image's corners, 0..1.
     """
 
     blur_px: float = 0.6
     full_well_e: float = 9000.0
     read_noise_e: float = 8.0
-    exposure: float = 1.0
     vignetting: float = 0.3
 
 
@@ -154,7 +152,6 @@ class SimulationOptions:
     Attributes:
         carrier: what carries the board.
         lidar: errors of all LiDARs; None for those of each one's data sheet.
-        range_sigma_m: replaces that of every LiDAR; None for `lidar` unchanged.
         camera: the cameras' errors.
         distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
             fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
@@ -164,7 +161,6 @@ class SimulationOptions:
             ones at most; never more than 0.8 of the tolerances that the profile gives.
         mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
-        print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
         motion: whether the board is held still or moved by hand; only a moving one makes events.
         hand: how it moves.
         events: errors of cameras with a channel of events; their optics are `camera`'s.
@@ -177,7 +173,6 @@ class SimulationOptions:
 
     carrier: Carrier = "stand"
     lidar: LidarNoise | None = None
-    range_sigma_m: float | None = None
     camera: CameraNoise = field(default_factory=CameraNoise)
     distance_m: tuple[float, float] = (1.2, 4.0)
     roll_deg: tuple[float, float] = (45.0, 15.0)
@@ -185,7 +180,6 @@ class SimulationOptions:
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02
     mounting_seed: int | None = None
-    print_reflectivity: float = 0.85
     motion: Motion = "still"
     hand: HandMotion = field(default_factory=HandMotion)
     events: EventNoise = field(default_factory=EventNoise)
@@ -198,13 +192,6 @@ class SimulationOptions:
     def mounting_of(self, seed: int) -> int:
         """Return the seed of the mounting in the session of a seed."""
         return seed if self.mounting_seed is None else self.mounting_seed
-
-    def noise_of(self, sheet: DataSheet) -> LidarNoise:
-        """Give the errors of a LiDAR, with the options that change them applied."""
-        noise = self.lidar or LidarNoise.of(sheet)
-        if self.range_sigma_m is not None:
-            noise = replace(noise, range_sigma_m=self.range_sigma_m)
-        return noise
 
     @classmethod
     def for_rig(cls, name: str, motion: Motion = "still") -> "SimulationOptions":

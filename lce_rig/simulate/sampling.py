@@ -73,9 +73,7 @@ class StagedBoard:
         """Build the scene at a time."""
         T_world_board, stage = self.trajectory.at(t_ns), self.stage
         carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, deepcopy(self.carrier_rng))
-        return Scene(
-            stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity
-        )
+        return Scene(stage.room.raycaster, carrier, stage.board, T_world_board)
 
     def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
         """Expose an image about a time: the mean of what is seen while the shutter is open."""

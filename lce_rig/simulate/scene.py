@@ -144,7 +144,7 @@ class Scene:
         moving: what stands elsewhere in each capture: the board's carrier.
         board: the board.
         T_world_board: (4, 4).
-        print_reflectivity: of the dark squares at the LiDAR's wavelength.
+        print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
 
     Surfaces are numbered static, then moving, then the board (`board_index`).
     """

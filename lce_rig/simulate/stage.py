@@ -162,7 +162,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
             raise ProfileError(f"lidars.{name}.model: {settings.model} cannot be simulated", hint)
         sheets[name] = sheet
     models = {name: LidarModel.of(sheet, rig.lidars[name].rate_hz) for name, sheet in sheets.items()}
-    noise = {name: options.noise_of(sheet) for name, sheet in sheets.items()}
+    noise = {name: options.lidar or LidarNoise.of(sheet) for name, sheet in sheets.items()}
     mounted = options.mounting_of(seed)
     bias = {}
     for k, (name, model) in enumerate(models.items()):

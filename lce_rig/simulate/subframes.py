@@ -38,7 +38,7 @@ class MovingView:
         backdrop: the camera and the standing room.
         board: the board.
         trajectory: where it is.
-        lens: the camera's errors; blur, exposure and vignetting count.
+        lens: the camera's errors; blur and vignetting count.
     """
 
     backdrop: Backdrop

@@ -10,7 +10,6 @@ from pathlib import Path
 import lce_rig as lce
 from benchmarks.furniture import Furniture
 from benchmarks.kept import kept_folder
-from benchmarks.recordings import RIGS
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
@@ -25,7 +24,6 @@ from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrins
 
 ROOMS = Path("build/rooms")
 N_CAPTURES = 10
-RIG_NAMES = ("rlfs", "rles", "os1_64")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +82,12 @@ def furnished_room(
     """Read a session from a folder, or simulate it and keep it there.
 
     Args:
-        rig_name: one of RIG_NAMES.
+        rig_name: of a shipped profile.
         seed: of room, furniture, truth, placements and noise.
         n_captures: placements of the board.
         folder: of sessions, see `kept_folder`.
     """
-    rig, options = _small_rig(rig_name), _options(rig_name)
+    rig, options = _small_rig(rig_name), replace(SimulationOptions.for_rig(rig_name), furnish=Furniture())
     path = kept_folder(folder, rig, options, is_detected=False) / f"{n_captures}-{seed:04d}"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,14 +100,8 @@ def furnished_room(
     return FurnishedRoom(Session.open(path), truth)
 
 
-def _options(rig_name: str) -> SimulationOptions:
-    options = replace(SimulationOptions.for_rig(rig_name), furnish=Furniture())
-    # Like the recording: far boards, held upright.
-    return replace(options, distance_m=(2.6, 3.6), roll_deg=(0.0, 15.0)) if rig_name == "os1_64" else options
-
-
 def _small_rig(rig_name: str) -> Rig:
-    rig = load_rig(str(RIGS / "os1_64.yaml") if rig_name == "os1_64" else rig_name)
+    rig = load_rig(rig_name)
     (name,) = rig.cameras
     camera, lens = rig.cameras[name], rig.cameras[name].intrinsics
     if camera.resolution_px[0] >= 1000:

@@ -268,7 +268,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[B
         for seed in range(n_seeds)
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
-    levels = _true_levels(case.options().noise_of(VLP_16), [terms.edges for terms in at_truth])
+    levels = _true_levels(case.options().lidar or LidarNoise.of(VLP_16), [terms.edges for terms in at_truth])
     priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=EDGE_SHIFT_SIGMA_M)
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = fit_extrinsic(session.candidates, board, options)
