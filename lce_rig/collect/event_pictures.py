@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-from lce_rig.collect.findings import READ_EVENTS_GONE_BY, READ_EVENTS_NOT_BEGUN
+from lce_rig.collect.findings import READ_EVENTS_GONE_BY, READ_NO_EVENTS_AT_SCAN
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.detect.events.reconstructor import Reconstructor
@@ -16,7 +16,7 @@ from lce_rig.timing.scan_pairing import (
     rig_time_ns,
 )
 
-_NOT_BEGUN = READ_EVENTS_NOT_BEGUN.refusal()
+_NOT_BEGUN = READ_NO_EVENTS_AT_SCAN.refusal()
 _GONE_BY = READ_EVENTS_GONE_BY.refusal()
 
 

@@ -36,11 +36,6 @@ GUIDE_PREDICTED = Kind(
 GUIDE_ADD = Kind(
     "guide.add", "captures to add, where each reduces the uncertainty most", _placements, severity="note"
 )
-READ_EVENTS_NOT_BEGUN = Kind(
-    "read.events_not_begun",
-    "no events yet at the time of the scan",
-    "start the event camera first, or check that both sensors' clocks agree",
-)
 READ_EVENTS_GONE_BY = Kind(
     "read.events_gone_by",
     "the scan arrived after the events that follow it",

@@ -29,7 +29,7 @@ from lce_rig.rig import CameraSettings
 _N_SLOTS = 2048
 _PAUSE_S, _SILENCE_S = 0.002, 5.0
 _MAX_CLOCK_ERROR_MS = 500.0
-_RISING, _RESET = "EXTERNAL_SIGNAL_RISING_EDGE", "TIMESTAMP_RESET"
+_RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
 _US_S = 1e6
 _US = timedelta(microseconds=1)
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
@@ -82,7 +82,7 @@ class DavisSource(LiveSource):
         self._channel = settings.first_channel("frames") or "frames"
         self._rates = {"events": RateMeter(), "frames": RateMeter()}
         self._delays_ns: deque[int] = deque(maxlen=100)
-        self._n_pulses = self._n_frames_lost = self._n_resets = 0
+        self._n_pulses = self._n_frames_lost = 0
         interval_us = settings.driver.controls.get("frame_interval_us", 0)
         self._interval_us = float(interval_us) if isinstance(interval_us, int | float) else 0.0
         self._last_frame_us: int | None = None
@@ -121,8 +121,6 @@ class DavisSource(LiveSource):
             clock = findings.DAVIS_CLOCK(delay_ms=delay_ms)
             if abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
                 problems.append(findings.CLOCK_DIFFERS(difference_s=abs(delay_ms) / 1000))
-        if self._n_resets:
-            problems.append(findings.CLOCK_RESTARTED(n=self._n_resets))
         return SourceStatus(
             self.sensor,
             n_lost=self._n_frames_lost,
@@ -144,7 +142,6 @@ class DavisSource(LiveSource):
         if frame is not None:
             samples.append(self._to_image(frame, host_ns))
         for trigger in (self._input.getNextTriggerBatch() or ()) if self._has["pulses"] else ():
-            self._n_resets += trigger.type.name == _RESET
             if trigger.type.name == _RISING:  # Others are of the camera's own making.
                 samples.append(Pulse(self.sensor, trigger.timestamp * NS_PER_US, self._n_pulses, host_ns))
                 self._n_pulses += 1

@@ -103,13 +103,8 @@ DAVIS_CLOCK = note_kind(
 )
 NO_CLOCK_FITS = warning_kind(
     "clock.none_fits",
-    "no clock fits the timestamps (image age by {ages}); arrival times are used",
+    "no clock alone fits the timestamps (image age by {ages})",
     "set driver.frame_timing.clock",
-)
-CLOCK_AMBIGUOUS = warning_kind(
-    "clock.ambiguous",
-    "the clock of the timestamps is uncertain by {spread_ms:.3g} ms",
-    "set driver.frame_timing.clock if you know it",
 )
 EXPOSURE_UNKNOWN = warning_kind(
     "clock.exposure_unknown",
@@ -130,9 +125,6 @@ CLOCK_DIFFERS = warning_kind(
     "clock.differs_from_computer",
     "its clock and this computer's differ by {difference_s:.3g} s (limit 0.5 s)",
     "open the camera again; stop programs that set this computer's clock",
-)
-CLOCK_RESTARTED = warning_kind(
-    "clock.restarted", "its clock restarted {n} times: a sync cable sent a reset", "open the camera again"
 )
 
 BOARD_CLOCK = note_kind("clock.board", _board_clock)

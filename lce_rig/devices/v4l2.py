@@ -177,13 +177,11 @@ class StampClock:
 
     def problems(self) -> list[Finding]:
         """List the problems of the timestamps."""
-        if self._delays_ns and self.used is None:
+        if self._delays_ns and (self.used is None or self._spread_ns > _HARMLESS_NS):
             ages = ", ".join(
                 f"{name} {significant(delay_ns / 1e6, 3)} ms" for name, delay_ns in self._delays_ns.items()
             )
             return [findings.NO_CLOCK_FITS(ages=ages)]
-        if self._spread_ns > _HARMLESS_NS:
-            return [findings.CLOCK_AMBIGUOUS(spread_ms=self._spread_ns * 1e-6)]
         return []
 
 

@@ -18,7 +18,6 @@ from lce_rig.scene.findings import (
     FLAT,
     LARGE_SCATTER,
     NO_PEAK,
-    SIDE_WITHOUT_EDGES,
     UNCHANGED,
     UNKNOWN,
 )
@@ -34,7 +33,6 @@ _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.10, 0.05, 0.15])])
 NEARLY = 0.1
 """What scores so much less alone, as a share, may be what changed."""
 _MIN_EDGES = 60
-_LEAST_SHARE = 0.05  # of the edges in a third of the image
 _MIN_PARTS = 6  # of the image, that carry edges
 _MIN_SCORE = 0.10  # mean log-likelihood ratio of a depth edge; 0 where edges do not belong together
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
@@ -56,7 +54,7 @@ class Drift:
 
     Attributes:
         axes: one verdict each, order of MOTIONS; all "unknown" where nothing could be compared.
-        findings: the summary first, then one of each axis and what is missing.
+        findings: the summary first, then one of each axis.
         T_cam_lidar: (4, 4) deployed.
         n_captures, n_edges: compared.
         is_compared: whether there were edges enough.
@@ -93,24 +91,16 @@ def watch(views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array
         T_cam_lidar: (4, 4) deployed.
         cov: (6, 6) of the deployed extrinsics' tangent.
     """
-    n_edges, missing = 0, []
+    n_edges = 0
     if views and any(len(view.edges) for view in views):
         alignment = Alignment(views, intrinsics, T_cam_lidar)
         n_edges = len(alignment)
-        # Thirds of the image without edges.
-        thirds = [part.sum() for part in np.array_split(alignment.weight_of_parts.sum(axis=1), 3)]
-        shares = np.array(thirds) / max(sum(thirds), 1e-12)
-        missing = [
-            SIDE_WITHOUT_EDGES(side, share=float(share))
-            for side, share in zip(("left", "middle", "right"), shares, strict=True)
-            if share < _LEAST_SHARE
-        ]
     # The parts of the image that carry edges.
     n_parts = int(np.count_nonzero(alignment.weight_of_parts)) if n_edges else 0
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
         few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
         axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in MOTIONS)
-        return Drift(axes, (few, *missing), T_cam_lidar, len(views), n_edges, is_compared=False)
+        return Drift(axes, (few,), T_cam_lidar, len(views), n_edges, is_compared=False)
 
     sigma_deployed = np.sqrt(np.diag(cov))
     curves = [alignment.curve(axis, np.zeros(6)) for axis in range(6)]
@@ -125,7 +115,7 @@ def watch(views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array
             findings.append(AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures))
         else:
             findings.append(KINDS[axis.reason or AXIS_UNCHANGED.code](axis.axis, **axis.figures))
-    return Drift(axes, (*findings, *missing), T_cam_lidar, len(views), n_edges)
+    return Drift(axes, tuple(findings), T_cam_lidar, len(views), n_edges)
 
 
 def _decide(alignment: Alignment, curves: list[Curve], sigma_deployed: Array) -> tuple[AxisDrift, ...]:

@@ -134,9 +134,3 @@ NO_PEAK = Kind(
     _BOARD,
     severity="warning",
 )
-SIDE_WITHOUT_EDGES = Kind(
-    "scene.side_without_edges",
-    "no edges of the scene in the {subject} third of the images ({share:percent} of all)",
-    _RECORD,
-    severity="note",
-)

@@ -71,7 +71,7 @@ def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig):
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
     assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (750,)]
     counts = {refusal.code: n for refusal, n in tally.counts()}
-    assert counts == {"read.events_not_begun": 30, "read.network_settling": 7}
+    assert counts == {"read.no_events_at_scan": 30, "read.network_settling": 7}
 
 
 def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig):

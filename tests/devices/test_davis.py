@@ -144,7 +144,7 @@ def test_another_size_is_another_camera(recording):
         list(samples)
 
 
-def test_a_reset_of_the_cameras_clock_is_noticed_and_colour_frames_stay_bgr(tmp_path):
+def test_a_reset_of_the_cameras_clock_is_no_pulse_and_colour_frames_stay_bgr(tmp_path):
     config = dv.io.MonoCameraWriter.Config("DAVIS346_00000499")
     config.addEventStream(SIZE)
     config.addFrameStream(SIZE)
@@ -156,10 +156,9 @@ def test_a_reset_of_the_cameras_clock_is_noticed_and_colour_frames_stay_bgr(tmp_
     reset = dv.Trigger(START_US, dv.TriggerType.TIMESTAMP_RESET)
     writer.writeTriggerPacket(dv.TriggerPacket(dv.TriggerPacket.TriggersVector([reset])))
     del writer
-    (image,), source = play(tmp_path / "davis.aedat4", camera())
+    (image,), _ = play(tmp_path / "davis.aedat4", camera())
     assert isinstance(image, Image) and (image.pixels == pixels).all()
     assert image.stamp_ns == 1000 * START_US + 500_000
-    assert "clock.restarted" in [problem.code for problem in source.status().problems]
 
 
 SENDER = """

@@ -29,14 +29,14 @@ def test_complaints_of_a_driver_stand_in_the_line_they_belong_to():
         "problems": (
             Finding("device.control_differs", "warning"),
             Finding("stream.damaged_images", "warning", figures={"n": 3}),
-            Finding("clock.restarted", "warning", figures={"n": 1}),
+            Finding("clock.differs_from_computer", "warning", figures={"difference_s": 1}),
         ),
     }
     exam = examination(camera(**status))
     device, stream = look(check_device, exam, "cam"), look(check_stream, exam, "cam")
     assert device.severity == stream.severity == "warning"
     assert codes(device)[1:] == ["device.control_differs"]
-    assert "stream.damaged_images" in codes(stream) and "clock.restarted" not in codes(stream)
+    assert "stream.damaged_images" in codes(stream) and "clock.differs_from_computer" not in codes(stream)
     assert {found.subject for found in (*device.findings, *stream.findings)} == {"cam"}
 
 

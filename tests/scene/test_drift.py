@@ -112,15 +112,3 @@ def test_too_few_edges_cannot_tell(seen):
     for views in ([], [replace(view, edges=few)]):
         drift = judge(seen, views=views)
         assert drift.state == "unknown" and drift.findings[0].code == "scene.few_edges"
-
-
-def test_a_side_without_edges_is_named(seen):
-    lens = seen.rig.cameras["cam"].to_intrinsics()
-    T = seen.truth.T_cam_lidar
-    views = []
-    for view in seen.views:
-        right = (view.edges.points @ T[0, :3] + T[0, 3]) > 0
-        views.append(replace(view, edges=view.edges.select(right)))
-    assert Alignment(views, lens, T).weight_of_parts[:3].sum() == 0
-    found = judge(seen, views=views).findings
-    assert "left" in [f.subject for f in found if f.code == "scene.side_without_edges"]
