@@ -26,7 +26,7 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.findings import FEW_AGREE, OUTLIER, TURNED
+from lce_rig.calibrate.findings import FEW_AGREE, TURNED
 from lce_rig.calibrate.likelihood.fit import fit_boards
 from lce_rig.calibrate.likelihood.layout import OWN
 from lce_rig.calibrate.likelihood.levels import what_is_known
@@ -55,9 +55,8 @@ _NEARLY_SQUARE = 0.1
 # A board in the two scans may differ by so much about its normal; more is another thing of its size.
 _MOST_TURN_RAD = np.radians(15.0)
 _STEPS = 5
-# Captures farther off than this many standard deviations, or medians of all, count less than in full (Huber),
-# outliers hardly.
-_HUBER, _FARTHEST, _OUTLIER = 1.5, 5.0, 1e-3
+# Captures farther off than this many standard deviations, or medians of all, count less than in full (Huber).
+_HUBER = 1.5
 # A lens, lateral and vertical, follows from how ring ends shear an oblique plate. Errors of their model that
 # all boards share, and that no scatter shows, displaced it by so much in simulated sessions of an OS1-64.
 _LENS_ERROR_M = np.array([0.0025, 0.0015])
@@ -88,56 +87,14 @@ class PairEstimate(NamedTuple):
     """Two LiDARs' pose to each other, in an optical frame of the first.
 
     Attributes:
-        estimate: of T_optical_second; its captures include outliers, which the checks are to see.
-        trust: (F,) weight of each capture in its cost.
+        estimate: of T_optical_second.
+        rejected: the other captures in which both see a plate.
         T_view: (4, 4) T_optical_first.
     """
 
     estimate: CalibrationEstimate
-    trust: Array
+    rejected: Sequence[Observation]
     T_view: Array
-
-    @property
-    def recount(self) -> Array:
-        """Factors (F,) by which captures count in full; outliers only where they agree among themselves.
-
-        Captures after a sensor moved fit one other mounting; other things of the plate's size fit none.
-        """
-        cost = self.estimate.cost
-        assert cost is not None
-        in_full = cost.weighted(1 / self.trust)
-        H, g = in_full.hessians[:, :6, :6], in_full.gradients[:, :6]
-        alone, covs = -np.linalg.solve(H, g[..., None])[..., 0], np.linalg.inv(H)
-        apart = alone[:, None] - alone
-        off = np.sqrt(np.einsum("abi,abij,abj->ab", apart, np.linalg.inv(covs[:, None] + covs), apart) / 6)
-        is_outlier = self.trust <= _OUTLIER
-        usual = max(float(np.median(off[~is_outlier][:, ~is_outlier])), 1.0)
-        agrees = (off < _FARTHEST * usual) & is_outlier & is_outlier[:, None]
-        is_alone = is_outlier & (agrees.sum(axis=0) < 2)
-        return np.where(is_alone, 1.0, 1 / self.trust)
-
-    @property
-    def without_outliers(self) -> CalibrationEstimate:
-        """The estimate with outliers among the refused captures."""
-        residuals = self.estimate.residuals
-        plane_m, edges_m = (
-            float(np.median([getattr(r, name) for r in residuals])) for name in ("plane_rms_m", "edge_rms_m")
-        )
-        outliers = {
-            r.capture: OUTLIER.refusal(
-                plane_m=r.plane_rms_m, edges_m=r.edge_rms_m, plane_median_m=plane_m, edges_median_m=edges_m
-            )
-            for r, trust in zip(residuals, self.trust, strict=True)
-            if trust <= _OUTLIER
-        }
-        kept = {name: o for name, o in self.estimate.observations.items() if name not in outliers}
-        return replace(
-            self.estimate,
-            observations=kept,
-            fitted=kept,
-            residuals=tuple(r for r in residuals if r.capture in kept),
-            refused=dict(sorted({**self.estimate.refused, **outliers}.items())),
-        )
 
 
 def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateSettings) -> PlacedBoards:
@@ -187,50 +144,43 @@ def estimate_between_lidars(
             direction undetermined, which is named.
     """
     consensus = find_consensus(candidates, board)
-    agreed, T_consensus = consensus.observations, consensus.T_cam_lidar
+    agreed = {o.capture: o for o in consensus.observations}
+    every = [agreed.get(o.capture, o) for o in sorted(candidates, key=lambda o: o.capture)]
     seen = []
-    for o in agreed:
+    for o in every:
         apart_m = [
             np.linalg.norm((each.T_lidar_board - o.image.T_cam_board)[:3, 3]) for each in first[o.capture]
         ]
         seen.append(first[o.capture][int(np.argmin(apart_m))])
     one = place_boards(seen, board, settings[0])
-    other = place_boards([o.lidar for o in agreed], board, settings[1])
-    turns = _turned_alike(one.T, T_consensus @ other.T, board)
-    other = replace(other, T=other.T @ turns)
-    apart = difference(T_consensus @ other.T, one.T)
-    spins_rad = np.abs(np.einsum("fi,fi->f", apart[:, 3:], one.T[:, :3, 2]))
-    T_view = optical_frame(one.T[:, :3, 3])
+    T_view = optical_frame(one.T[[o.capture in agreed for o in every], :3, 3])
     R = np.kron(np.eye(2), T_view[:3, :3])
-    one = replace(one, T=T_view @ one.T, cov=R @ one.cov @ R.T, shared=R @ one.shared)
-    refused, observations = dict(consensus.refused), []
-    for k, o in enumerate(agreed):
-        if spins_rad[k] > _MOST_TURN_RAD:
-            refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spins_rad[k])))
+    refused, placed, observations = dict(consensus.refused), [], []
+    for o, T, cov in zip(every, one.T, one.cov, strict=True):
+        image = replace(o.image, T_cam_board=T_view @ T, cov=R @ cov @ R.T, T_cam_board_alternative=None)
+        placed.append(replace(o, image=image))
+        if o.capture not in agreed:
             continue
-        image = replace(o.image, T_cam_board=one.T[k], cov=one.cov[k], T_cam_board_alternative=None)
-        lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turns[k])
+        turn, spin_rad = _turn_alike(T, consensus.T_cam_lidar @ o.lidar.T_lidar_board, board)
+        if spin_rad > _MOST_TURN_RAD:
+            refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spin_rad)))
+            continue
+        lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turn)
         observations.append(replace(o, image=image, lidar=lidar))
     if len(observations) < len(agreed) / 2:
         raise NotEnoughDataError.of(
             FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))
         )
-    solved = solve(observations, board)
-    # Without held-out residuals; outliers stay for the checks.
-    start = Start(
-        solved.T_cam_lidar,
-        solved.certificate,
-        observations,
-        refused,
-        np.full(len(observations), np.nan),
-        solved.diagnostics,
-    )
-    used = spins_rad <= _MOST_TURN_RAD
-    one, other = (
-        replace(each, T=each.T[used], cov=each.cov[used], shared=each.shared[used]) for each in (one, other)
-    )
-    estimate, trust = _fit_poses(start, one, other, board)
-    return PairEstimate(estimate, trust, T_view)
+    start = solve(observations, board)
+    start = replace(start, refused=refused | dict(start.refused))
+    used = {o.capture for o in start.observations}
+    is_used = [o.capture in used for o in every]
+    cov = (R @ one.cov @ R.T)[is_used]
+    one = replace(one, T=(T_view @ one.T)[is_used], cov=cov, shared=(R @ one.shared)[is_used])
+    other = place_boards([o.lidar for o in start.observations], board, settings[1])
+    estimate = _fit_poses(start, one, other, board)
+    rejected = [o for o, is_one in zip(placed, is_used, strict=True) if not is_one]
+    return PairEstimate(estimate, rejected, T_view)
 
 
 def close_loops(edges: Mapping[tuple[str, str], tuple[Array, Array]]) -> dict[tuple[str, str], Array]:
@@ -286,23 +236,22 @@ def optical_frame(middles: Array) -> Array:
     return pose(np.stack([np.cross(down, forward), down, forward]), np.zeros(3))
 
 
-def _turned_alike(T: Array, other: Array, board: Board) -> Array:
-    """Choose the turns (F, 4, 4) about the plate's normal that bring poses `other` (F, 4, 4) next to T."""
+def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
+    """Choose the turn (4, 4) about the plate's normal that brings a pose `other` next to T (4, 4).
+
+    Returns:
+        The turn, and the angle about the normal that is left, rad.
+    """
     sides = board.width_m, board.height_m
     n_fold = 4 if max(sides) < (1 + _NEARLY_SQUARE) * min(sides) else 2
     steps = 2 * np.pi / n_fold * np.arange(n_fold)
     turns = pose(exp_so3(steps[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((n_fold, 3)))
-    angles = [
-        [rotation_angle(a[:3, :3], (b @ turn)[:3, :3]) for turn in turns]
-        for a, b in zip(T, other, strict=True)
-    ]
-    return np.asarray(turns[np.argmin(angles, axis=1)])
+    turn = turns[int(np.argmin(rotation_angle(T[:3, :3], (other @ turns)[:, :3, :3])))]
+    return turn, abs(float(difference(other @ turn, T)[3:] @ T[:3, 2]))
 
 
-def _fit_poses(
-    start: Start, one: PlacedBoards, other: PlacedBoards, board: Board
-) -> tuple[CalibrationEstimate, Array]:
-    """Minimise (1) from Algorithm 1's solution; return also the weights (F,) of the captures.
+def _fit_poses(start: Start, one: PlacedBoards, other: PlacedBoards, board: Board) -> CalibrationEstimate:
+    """Minimise (1) from Algorithm 1's solution.
 
     Args:
         start: with the F captures used.
@@ -311,7 +260,7 @@ def _fit_poses(
     """
     placement = group_placements(start.observations)
     once = 1 / np.bincount(placement)[placement]
-    T, trust = start.T_cam_lidar, once
+    T = start.T_cam_lidar
     n_one, n_other = one.shared.shape[2], other.shared.shape[2]
     prior = np.diag(np.r_[np.zeros(6), np.ones(n_one + n_other)])
     errors = np.zeros(n_one + n_other)
@@ -325,8 +274,7 @@ def _fit_poses(
         chi2 = np.einsum("fi,fij,fj->f", residual, information, residual)
         off = np.sqrt(np.maximum(chi2 / 6, 1e-12))
         off /= max(float(np.median(off)), 1.0)
-        trust = np.where(off > _FARTHEST, _OUTLIER, np.minimum(1, _HUBER / off))
-        weighted = (once * trust)[:, None, None] * np.swapaxes(J, 1, 2) @ information
+        weighted = (once * np.minimum(1, _HUBER / off))[:, None, None] * np.swapaxes(J, 1, 2) @ information
         cost = Quadratics(
             (weighted @ residual[..., None])[..., 0],
             weighted @ J,
@@ -343,4 +291,4 @@ def _fit_poses(
     cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
     figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
     estimate = report(start, T, cov, board, figures)
-    return replace(estimate, method="ml", cost=cost, laser_angles=other.laser_angles), trust
+    return replace(estimate, method="ml", laser_angles=other.laser_angles)

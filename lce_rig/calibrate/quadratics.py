@@ -117,21 +117,9 @@ class Quadratics:
             prior_gradient=self.prior_gradient[unknowns],
         )
 
-    def weighted(self, weight: Array) -> "Quadratics":
-        """Multiply each capture's cost by its weight (F,)."""
-        return replace(
-            self,
-            gradients=weight[:, None] * self.gradients,
-            hessians=weight[:, None, None] * self.hessians,
-        )
-
-    def settled(self, x: Array | None = None) -> "Quadratics":
-        """Hold all unknowns but the first six at their estimate: quadratics in these, about their optimum.
-
-        Args:
-            x: (p,) estimate of all unknowns; None for the optimum.
-        """
-        x = self.optimum() if x is None else x
+    def settled(self) -> "Quadratics":
+        """Hold all unknowns but the first six at their optimum: quadratics in these, about it."""
+        x = self.optimum()
         return replace(
             self,
             gradients=(self.gradients + self.hessians @ x)[:, :6],

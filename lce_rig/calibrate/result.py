@@ -7,7 +7,6 @@ import numpy as np
 
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import ends_on_board, extract_features, plane_residuals
-from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
@@ -78,8 +77,6 @@ class CalibrationEstimate:
         method: that found it, as `CalibrateOptions.method`.
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
-        cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
-            cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
             its standard deviation at usual noise, both by the likelihood; None without it.
         laser_angles: rms error of the lasers' azimuths and elevations, deg, as `uncertainty.laser_angles`.
@@ -100,7 +97,6 @@ class CalibrationEstimate:
     diagnostics: Diagnostics
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
-    cost: Quadratics | None = None
     turns: Array | None = None
     laser_angles: Mapping[str, float] = field(default_factory=dict)
     lens: SessionLens | None = None

@@ -245,15 +245,7 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
     cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
     figures = _add_figures(start.diagnostics, joint, camera, inflation)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
-    # The cost in the extrinsics alone, the camera's own first; constant errors are held fixed.
-    n_cameras = len(joint.T_cam_lidar)
-    order = [camera, *(c for c in range(n_cameras) if c != camera)]
-    own = np.concatenate([joint.state.layout.camera(c) for c in order])
-    # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
-    prior = np.eye(len(own)) if n_cameras > 1 else np.zeros((6, 6))
-    cost = replace(joint.cost.of(own), prior=prior, prior_gradient=np.zeros(len(own)))
-    turns = _turns(joint, camera)
-    return replace(estimate, method="ml", cost=cost, turns=turns, laser_angles=laser_angles(joint))
+    return replace(estimate, method="ml", turns=_turns(joint, camera), laser_angles=laser_angles(joint))
 
 
 def with_profile(

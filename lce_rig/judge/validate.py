@@ -93,7 +93,6 @@ def validate(
     lidar: LidarSettings,
     lens: Intrinsics | None,
     rejected: Sequence[Observation] = (),
-    recount: Array | None = None,
 ) -> Validation:
     """Check a result on its own captures.
 
@@ -101,11 +100,9 @@ def validate(
         estimate: the result of any method.
         rig: board, targets and limits.
         lidar: its range error settings.
-        lens: of the camera, as the profile says; None where a LiDAR is in its place.
+        lens: of the camera, as the profile says; None where a LiDAR is in its place, which has no scale and
+            no pattern.
         rejected: captures in which both sensors see the board, that the estimate does not use.
-        recount: (F,) factor of each capture in the estimate's own cost, where that is to judge subsets: of
-            boards in two scans, whose poses are less accurate than those in images. There is no scale and no
-            pattern, too.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
@@ -120,9 +117,8 @@ def validate(
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
-    own_cost = None if recount is None else estimate.cost
     if len(expansion.groups) >= _MIN_PLACEMENTS:
-        if own_cost is None:
+        if lens is not None:
             scale, pattern = scale_of(expansion), pattern_of(expansion)
             # Neither chance nor the profile's deviation explains an offset that contradicts it.
             cov = pattern[1] + rig.board.pattern_offset_sigma_m**2 * np.eye(2)
@@ -130,9 +126,6 @@ def validate(
             pattern = pattern if np.exp(-chi2 / 2) < LEAST_CHANCE else None
         # A wrong place of the pattern would look like captures that differ.
         settled = expansion.hold((SCALE,) if pattern is not None else OF_PROFILE).settled()
-        if own_cost is not None and recount is not None:
-            # Outliers may be captures of another mounting.
-            settled = own_cost.weighted(recount).settled(own_cost.optimum())
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         names = estimate.used
@@ -141,7 +134,7 @@ def validate(
             *contrast_halves(settled, centres, names),
             *find_groups(settled, names),
         )
-        if estimate.turns is not None and recount is None:
+        if estimate.turns is not None:
             contrasts += find_turned(estimate.turns, centres, settled.groups, names)
     contradictions = list(find_contradictions(estimate, scale, pattern, contrasts, rig))
     cov_agreed = estimate.cov + summed_covariance(known)

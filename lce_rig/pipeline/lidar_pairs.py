@@ -119,14 +119,9 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
         EstimateSettings.of(options, rig.lidars[first]),
         EstimateSettings.of(options, rig.lidars[second]),
     )
-    found = estimate_between_lidars(candidates, boards, board, settings)
-    estimate, T_view = found.without_outliers, found.T_view
-    rejected = [
-        match_candidates(_seen_from(T_view, o), board, estimate.T_cam_lidar)
-        for o in candidates
-        if o.capture in found.estimate.refused
-    ]
-    validation = validate(found.estimate, rig, rig.lidars[second], None, rejected, found.recount)
+    estimate, rejected, T_view = estimate_between_lidars(candidates, boards, board, settings)
+    rejected = [match_candidates(o, board, estimate.T_cam_lidar) for o in rejected]
+    validation = validate(estimate, rig, rig.lidars[second], None, rejected)
     scans = detections.lidars
     n_captures = len(candidates) + len(lacking)
     T = invert(T_view) @ estimate.T_cam_lidar
