@@ -166,8 +166,6 @@ class Diagnostics:
     noise_spin_deg: float = math.nan
     noise_depth_m: float = math.nan
     noise_across_m: float = math.nan
-    alone_sigma_rotation_deg: float = math.nan  # standard deviations without the other cameras
-    alone_sigma_translation_m: float = math.nan
 
     def figures(self) -> dict[str, float]:
         """List the figures that are not NaN by name, sorted."""
@@ -236,9 +234,8 @@ class OtherCamera:
         T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
             extrinsics were not estimated together.
-        T_cam_other_pictures: (4, 4) from the images of both alone; None with too few boards.
-        apart_rotation_deg, apart_translation_m: distance of that from the composition of the extrinsics, each
-            estimated separately.
+        apart_rotation_deg, apart_translation_m: distance of the pose by the images of both alone from the
+            composition of the extrinsics, each estimated separately; None with too few boards.
         board_rms_m: distance between their middles of the same board, rms.
     """
 
@@ -246,7 +243,6 @@ class OtherCamera:
     n_captures: Count
     T_cam_other: Pose
     cov: Covariance | None
-    T_cam_other_pictures: Pose | None
     apart_rotation_deg: Size | None
     apart_translation_m: Size | None
     board_rms_m: Size

@@ -27,7 +27,7 @@ from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, invert, relative_pose, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, relative_pose, tangent_sizes
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
@@ -357,12 +357,8 @@ def _solve_together(
 def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
     """Replace a camera's own estimate by its part of a joint one."""
     estimate = together.estimates[alone.camera]
-    sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
     estimate = replace(
         estimate,
-        diagnostics=replace(
-            estimate.diagnostics, alone_sigma_rotation_deg=sigma_deg, alone_sigma_translation_m=sigma_m
-        ),
         channels=alone.estimate.channels,
         channel_difference=alone.estimate.channel_difference,
     )
@@ -449,14 +445,12 @@ def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraP
         joint[:6, :6] += own.cov_lens
         joint[6:, 6:] += other.cov_lens
         cov = np.asarray(J @ joint @ J.T)
-    seen = None if pair.from_images is None else pair.from_images.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart.tangent)
     return OtherCamera(
         camera=other.camera,
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=cov,
-        T_cam_other_pictures=seen if seen is None or k > other_k else invert(seen),
         apart_rotation_deg=apart_deg,
         apart_translation_m=apart_m,
         board_rms_m=pair.board_rms_m,

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from lce_rig.cli.main import run
-from lce_rig.core.geometry import difference, invert
+from lce_rig.core.geometry import difference
 from lce_rig.rig import dump_rig, load_rig
 from tests.shared import half_size
 
@@ -114,9 +114,5 @@ def test_two_cameras_are_calibrated_to_the_truth_and_to_each_other(lce_rig, of_t
         assert np.degrees(np.linalg.norm(error[3:])) < 0.3 and np.linalg.norm(error[:3]) < 0.015
         (seen,) = pairs[camera]["other_cameras"]
         assert seen["camera"] == other and seen["n_captures"] >= 8
-        by_pictures = difference(np.array(seen["T_cam_other_pictures"]), exact[camera] @ invert(exact[other]))
-        # Each camera has fitted its own lens, whose principal point turns its images.
-        assert np.degrees(np.linalg.norm(by_pictures[3:])) < 0.15
-        assert np.linalg.norm(by_pictures[:3]) < 0.006
         assert pairs[camera]["estimated_with"] == ([other] if method == "ml" else [])
     assert lce_rig("verify", session).code == 0

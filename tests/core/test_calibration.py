@@ -61,8 +61,8 @@ def full():
         uncertainty=(PointUncertainty(5.0, 1.25, 0.0125, 1.5, 0.015),),
         estimated_with=("right",),
         other_cameras=(
-            OtherCamera("right", 2, T, cov, T, 0.1, 0.001, 0.002),
-            OtherCamera("left", 2, T, None, None, None, None, 0.002),
+            OtherCamera("right", 2, T, cov, 0.1, 0.001, 0.002),
+            OtherCamera("left", 2, T, None, None, None, 0.002),
         ),
         cov_shared=0.1 * cov,
         contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),

@@ -63,7 +63,6 @@ def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
         assert own.estimated_with == (other,)
         error = difference(in_use(own.T_cam_lidar, own.intrinsics), TRUTH[name])
         assert error @ np.linalg.solve(own.cov, error) < 25  # 0.9997 of chi square with 6 degrees
-        assert own.sigma_rotation_deg < own.diagnostics.alone_sigma_rotation_deg
         assert own.estimated_with == (other,)
 
 
@@ -80,13 +79,12 @@ def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
         error = difference(T, truth)
         assert error @ np.linalg.solve(other.cov, error) < 25
         assert np.linalg.norm(error[:3]) < 0.001
-        assert np.linalg.norm(difference(other.T_cam_other_pictures, truth)[:3]) < 0.003
         assert other.apart_rotation_deg < 0.1
         assert other.board_rms_m < 0.003
     assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
 
 
-def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, together, by_paper):
+def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, by_paper):
     for name in (LEFT, RIGHT):
         alone = detections({name: session[name]})
         (own,) = calibrated(alone, PAPER, only(name)).values()
@@ -95,9 +93,6 @@ def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, 
         (other,) = by_paper[name].other_cameras
         assert other.cov is None
         assert other.apart_rotation_deg < 0.2
-        assert np.allclose(
-            other.T_cam_other_pictures, together[name].other_cameras[0].T_cam_other_pictures, atol=2e-3
-        )
 
 
 def only(camera):
@@ -111,7 +106,6 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     found = calibrated(detections(session, left=range(6), right=range(6, 12)), ML)
     for own in found.values():
         assert own.estimated_with == own.other_cameras == ()
-        assert np.isnan(own.diagnostics.alone_sigma_rotation_deg)
 
 
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
