@@ -10,7 +10,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import path_option, result_option, session_argument, split_names
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
-from lce_rig.export import EXPORTS, require_usable
+from lce_rig.export import EXPORTS, USUAL, load_exporter, require_usable
 from lce_rig.export.urdf import read_robot, write_into_urdf
 from lce_rig.pipeline.result_files import RESULT, result_folder
 
@@ -18,8 +18,9 @@ from lce_rig.pipeline.result_files import RESULT, result_folder
 def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
     """Print the formats with their files and end."""
     if is_asked and not context.resilient_parsing:
-        for name, form in EXPORTS.items():
-            show.say(f"{name + (' *' if form.is_usual else ''):<16} {form.about}")
+        for name in EXPORTS:
+            files = (load_exporter(name).__doc__ or "").partition("\n")[0].removeprefix("Write ")
+            show.say(f"{name + (' *' if name in USUAL else ''):<16} {files}")
         show.note("* unless others are named with --formats or as `exports` in the profile")
         context.exit()
 

@@ -184,25 +184,10 @@ class ProgressBar:
 def progress_bar(title: str) -> Iterator[ProgressBar]:
     """Show a progress bar of this title on stderr; nothing if stderr is not a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
-    from rich.text import Text
 
-    class Done(ProgressColumn):
-        """How many of how many are done; how long it has taken where the number is not known."""
-
-        def render(self, task: Task) -> Text:
-            if task.total is None:
-                return Text(f"{task.elapsed or 0.0:.0f} s")
-            return Text(f"{task.completed:.0f}/{task.total:.0f}")
-
-    class Left(TimeRemainingColumn):
-        """How long it takes yet, where the number to be done is known."""
-
-        def render(self, task: Task) -> Text:
-            return Text() if task.total is None else super().render(task)
-
-    columns = [TextColumn("{task.description}"), BarColumn(), Done(), Left(compact=True)]
+    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
     console = Console(stderr=True)
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield ProgressBar(bar, title)

@@ -118,50 +118,22 @@ class ExportJob:
 Exporter = Callable[[ExportJob], list[Path]]
 
 
-@dataclass(frozen=True)
-class Format:
-    """A form of output.
-
-    Attributes:
-        home: module of this package and function, imported when used.
-        about: its files and their purpose, one line.
-        is_usual: whether it is written unless others are named.
-    """
-
-    home: str
-    about: str
-    is_usual: bool = False
-
-
-def _usual(home: str, about: str) -> Format:
-    return Format(home, about, is_usual=True)
-
-
-EXPORTS: dict[str, Format] = {
-    "extrinsics": _usual(
-        "extrinsics:export_extrinsics", "extrinsics.yaml: pose, inverse, example point, covariance"
-    ),
-    "urdf": _usual("urdf:export_urdf", "RIG.urdf: for robot_state_publisher"),
-    "camera_info": _usual("ros_files:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"),
-    "static_tf": _usual(
-        "ros_files:export_static_tf", "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2"
-    ),
-    "ros2_launch": Format("ros_files:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"),
-    "tf_static_bag": Format(
-        "ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
-    ),
-    "kalibr": Format("other_tools:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
-    "autoware": Format(
-        "other_tools:export_autoware",
-        "sensor_kit_calibration.yaml, sensors_calibration.yaml: Autoware's individual_params",
-    ),
-    "fast_livo2": Format(
-        "other_tools:export_fast_livo2",
-        "fast_livo2_CAMERA.yaml (Rcl, Pcl), fast_livo2_camera_CAMERA.yaml: FAST-LIVO2",
-    ),
-    "koide3": Format("other_tools:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"),
-    "opencv": Format("other_tools:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
+# Format -> module of this package and function, imported when used; its docstring names the files.
+EXPORTS = {
+    "extrinsics": "extrinsics:export_extrinsics",
+    "urdf": "urdf:export_urdf",
+    "camera_info": "ros_files:export_camera_info",
+    "static_tf": "ros_files:export_static_tf",
+    "ros2_launch": "ros_files:export_ros2_launch",
+    "tf_static_bag": "ros_bag:export_tf_static_bag",
+    "kalibr": "other_tools:export_kalibr",
+    "autoware": "other_tools:export_autoware",
+    "fast_livo2": "other_tools:export_fast_livo2",
+    "koide3": "other_tools:export_koide3",
+    "opencv": "other_tools:export_opencv",
 }
+USUAL = ("extrinsics", "urdf", "camera_info", "static_tf")
+"""What is written unless others are named."""
 
 
 def load_exporter(name: str) -> Exporter:
@@ -172,13 +144,13 @@ def load_exporter(name: str) -> Exporter:
     """
     if name not in EXPORTS:
         raise UsageError(f"no export format is called {name}", f"Choose one of: {', '.join(EXPORTS)}")
-    exporter: Exporter = resolve_name(f"lce_rig.export.{EXPORTS[name].home}")
+    exporter: Exporter = resolve_name(f"lce_rig.export.{EXPORTS[name]}")
     return exporter
 
 
 def usual_formats(rig: Rig) -> tuple[str, ...]:
     """List the formats that are written unless others are named: the profile's `exports`, else the usual."""
-    return tuple(rig.exports) or tuple(name for name, form in EXPORTS.items() if form.is_usual)
+    return tuple(rig.exports) or USUAL
 
 
 def export(

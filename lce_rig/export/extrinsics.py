@@ -18,7 +18,7 @@ from lce_rig.rig import Rig
 
 
 def export_extrinsics(job: ExportJob) -> list[Path]:
-    """Write extrinsics.yaml."""
+    """Write extrinsics.yaml: pose, inverse, example point, covariance."""
     pairs = [_pair(calibration, job.rig) for calibration in job.calibrations]
     document = {"format_version": 1, "rig": job.rig.name, "made_by": MADE_BY, "pairs": pairs}
     return [job.write_yaml("extrinsics.yaml", job.head("extrinsics", *job.calibrations), document)]

@@ -90,7 +90,7 @@ def _matrix(lens: Intrinsics) -> list[float]:
 
 
 def export_kalibr(job: ExportJob) -> list[Path]:
-    """Write camchain_LIDAR.yaml for each LiDAR.
+    """Write camchain_LIDAR.yaml, Kalibr's camera chain.
 
     Kalibr has four radtan coefficients; a camera with more gets the four that fit best.
     """
@@ -124,7 +124,7 @@ def export_kalibr(job: ExportJob) -> list[Path]:
 
 
 def export_koide3(job: ExportJob) -> list[Path]:
-    """Write calib_CAMERA.json of each camera and LiDAR."""
+    """Write calib_CAMERA.json of direct_visual_lidar_calibration."""
     paths = []
     for c in job.of_cameras:
         lens, lines = lens_for(job, "koide3", c.camera, "radtan5")
@@ -150,7 +150,7 @@ def export_koide3(job: ExportJob) -> list[Path]:
 
 
 def export_fast_livo2(job: ExportJob) -> list[Path]:
-    """Write fast_livo2_CAMERA.yaml and fast_livo2_camera_CAMERA.yaml of each camera."""
+    """Write FAST-LIVO2's fast_livo2_CAMERA.yaml (Rcl, Pcl) and fast_livo2_camera_CAMERA.yaml."""
     paths = []
     for c in job.of_cameras:
         head = [
@@ -175,7 +175,7 @@ def export_fast_livo2(job: ExportJob) -> list[Path]:
 
 
 def export_opencv(job: ExportJob) -> list[Path]:
-    """Write opencv_CAMERA.yaml of each camera and LiDAR."""
+    """Write opencv_CAMERA.yaml for cv::FileStorage."""
     paths = []
     for c in job.of_cameras:
         camera, lidar = job.rig.cameras[c.camera], job.rig.lidars[c.lidar]
@@ -231,7 +231,7 @@ class _Entry(NamedTuple):
 
 
 def export_autoware(job: ExportJob) -> list[Path]:
-    """Write the sensors' poses in the kit, and the kit's on the vehicle where that is known.
+    """Write Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml where base_link is known.
 
     Without a frame `sensor_kit_base_link` in the robot's tree, the kit is where the first sensor's entry is.
     """

@@ -17,7 +17,7 @@ _TF_TYPE, _TF_STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
 
 
 def export_tf_static_bag(job: ExportJob) -> list[Path]:
-    """Write the bag tf_static/ with one latched message of all transforms, in place of an earlier one.
+    """Write tf_static/, a ROS 2 bag with one latched message of all transforms, in place of an earlier one.
 
     It holds the robot's own transforms on the way to the sensors too, as no other program publishes while a
     bag is played. The message is reliable and transient local, as tf2 wants it. metadata.yaml names lce-rig

@@ -20,7 +20,7 @@ from lce_rig.session.durable import write_atomically
 
 
 def export_camera_info(job: ExportJob) -> list[Path]:
-    """Write a file for each calibrated camera."""
+    """Write camera_info_CAMERA.yaml for ROS camera drivers."""
     paths = []
     for name, calibration in {c.camera: c for c in job.of_cameras}.items():
         path = job.folder / f"camera_info_{name}.yaml"
@@ -101,7 +101,7 @@ def _own_joints(job: ExportJob) -> list[Joint]:
 
 
 def export_static_tf(job: ExportJob) -> list[Path]:
-    """Write static_transforms.txt."""
+    """Write static_transforms.txt: static_transform_publisher lines, ROS 1 and 2."""
     joints = _own_joints(job)
     lines = [f"# {line}" for line in job.head("static transforms", *job.calibrations)]
     lines += [
@@ -118,7 +118,7 @@ def export_static_tf(job: ExportJob) -> list[Path]:
 
 
 def export_ros2_launch(job: ExportJob) -> list[Path]:
-    """Write RIG.launch.py, one static_transform_publisher a joint."""
+    """Write RIG.launch.py, a ROS 2 launch file with one static_transform_publisher per joint."""
     lines = [f"# {line}" for line in job.head("ROS 2 launch file", *job.calibrations)]
     lines += [
         "from launch import LaunchDescription",

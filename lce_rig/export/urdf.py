@@ -32,7 +32,7 @@ _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
 
 def export_urdf(job: ExportJob) -> list[Path]:
-    """Write RIG.urdf, and RIG-ROOT.urdf for sensors not connected with the base."""
+    """Write RIG.urdf for robot_state_publisher, and RIG-ROOT.urdf for sensors not connected with the base."""
     names = [f"-{tree.root.replace('/', '_')}" if index else "" for index, tree in enumerate(job.trees)]
     return [
         job.write(f"{job.rig.name}{name}.urdf", _urdf(tree, job))
