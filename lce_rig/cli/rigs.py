@@ -1,14 +1,12 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles; `lce-rig board`: a board to print for one."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import numpy as np
 
 from lce_rig.cli import show
-from lce_rig.cli.options import require_sensors
 from lce_rig.core.board import Board, BoardType
 from lce_rig.core.errors import ProfileError, SourceError, TargetError, UsageError
 from lce_rig.core.pattern import DICTIONARIES, dark_rectangles, n_markers_of
@@ -23,7 +21,6 @@ from lce_rig.rig import (
     dump_rig,
     edit_text,
     find_profile,
-    lens_settings,
     load_rig,
     read_profile,
     shipped_profiles,
@@ -163,7 +160,12 @@ def new_profile(
     else:
         origin = origin or "rlfs"
         parent = load_rig(origin)
-        values = [*_sensor_settings(parent, lidar, cameras, intrinsics, board), *values]
+        if has_sensors:
+            raise UsageError(
+                "--lidar, --camera and --intrinsics apply to recordings and numbers, not to a profile",
+                "Set keys of the profile: --set lidars.lidar.model=OS1-64",
+            )
+        values = [*(_board_settings(parent, board) if board is not None else []), *values]
         original = read_profile(find_profile(origin))
         text = derive_text(original, name, values, target, parent.name)
     if output == "-":
@@ -207,26 +209,12 @@ def _is_bag(path: Path) -> bool:
     return path.suffix in SUFFIXES
 
 
-def _sensor_settings(
-    parent: Rig, lidar: str | None, cameras: Sequence[str], intrinsics: Sequence[str], board: str | None
-) -> list[tuple[str, str]]:
-    """Give the keys that --lidar, --intrinsics and --board change in the profile that is derived from."""
-    require_sensors("camera", cameras, parent.cameras)
-    names = cameras or tuple(parent.cameras)[: len(intrinsics)]
-    if len(names) != len(intrinsics):
-        raise UsageError(
-            f"{len(intrinsics)} --intrinsics for {len(names)} cameras", "Give one for each --camera."
-        )
-    values = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", as_yaml(lidar))]
-    for name, text in zip(names, intrinsics, strict=True):
-        values += lens_settings(name, parse_intrinsics(text))
-    if board is not None:
-        stated = parent.board.model_dump(exclude_none=True, exclude_unset=True)
-        plate = {"type": "checkerboard"} | board_block(parse_board(board))
-        foreign = [key for key in stated if key not in plate and not key.endswith("sigma_m")]
-        values += [(f"board.{key}", as_yaml(value)) for key, value in plate.items()]
-        values += [(f"board.{key}", "null") for key in foreign]
-    return values
+def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:
+    """Give the keys that --board changes in the profile that is derived from."""
+    stated = parent.board.model_dump(exclude_none=True, exclude_unset=True)
+    plate = {"type": "checkerboard"} | board_block(parse_board(board))
+    foreign = [key for key in stated if key not in plate and not key.endswith("sigma_m")]
+    return [(f"board.{key}", as_yaml(plate.get(key))) for key in (*plate, *foreign)]
 
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
