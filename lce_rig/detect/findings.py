@@ -44,7 +44,7 @@ READ_NETWORK_SETTLING = Kind(
 READ_OUTSIDE_EVENTS = Kind(
     "read.outside_events",
     "the image is {gap_s:.3f} s before the first event or after the last one",
-    "check that both sensors' clocks agree; record events from before the first image to after the last",
+    "check both sensors' clocks; record events before and after all images",
 )
 READ_NO_EVENTS = Kind(
     "read.no_events",
