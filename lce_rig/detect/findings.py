@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from lce_rig.core.findings import Finding, Kind, Stage
 
-MOVE_SLOWLY = "move the board sideways, about 10 cm/s, from 1 s before the capture"
+MOVE_SLOWLY = "move the board sideways, 10 cm/s, from 1 s before"
 _CLOSER = "come closer, and move the board sideways at about 10 cm/s"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
@@ -167,7 +167,7 @@ IMAGE_HOT_PIXELS = Kind(
 IMAGE_HARDLY_MOVED = Kind(
     "image.hardly_moved",
     "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
-    MOVE_SLOWLY + "; uncover the lens",
+    "uncover the lens; " + MOVE_SLOWLY,
 )
 IMAGE_TOO_FAST = Kind(
     "image.too_fast",
