@@ -81,13 +81,13 @@ def deploy(
     opened = lce.Session.open(session)
     result = result_folder(opened.path, name)
     if dry_run:
-        plan = deployment.plan(result, opened.rig, target)
+        plan = deployment.plan(result, opened.rig, target, session=opened)
         _show_plan(plan, target, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
     try:
-        done = deployment.deploy(result, opened.rig, target, session=str(opened.path), reason=reason.strip())
+        done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
     except ResultRefusedError as error:
         forced = f"{again}{f' --name {name}' if name else ''} --force --reason TEXT"
         raise ResultRefusedError(

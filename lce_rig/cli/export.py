@@ -101,6 +101,7 @@ def export(
             output,
             formats=formats,
             is_forced=force,
+            session=opened,
             robot=robot,
             findings=findings,
         )

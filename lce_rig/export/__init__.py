@@ -16,6 +16,7 @@ from lce_rig.core.findings import Finding, Kind
 from lce_rig.export.robot_tree import RobotTree, build_trees, require_known
 from lce_rig.export.writing import yaml_text
 from lce_rig.rig import Rig
+from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
 
 LENS_FITTED = Kind(
@@ -30,6 +31,17 @@ NO_FRAME = Kind(
     "`lce-rig export {session} --formats {format} --tree URDF -o FOLDER`",
     severity="note",
 )
+NO_SESSION = Kind(
+    "export.no_session",
+    "{format} is not written: it needs the images and scans of a session",
+    "export from the session",
+    severity="warning",
+)
+NO_IMAGES = Kind(
+    "export.no_images",
+    "{format}: camera {subject} is left out: the session has no images of it",
+    severity="warning",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +53,7 @@ class ExportJob:
         rig: the profile the calibrations belong to.
         folder: for the files.
         robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
+        session: with the images and scans; None where only results are at hand.
         findings: content that was left out of the outputs or put into another form, and why; grows.
     """
 
@@ -48,6 +61,7 @@ class ExportJob:
     rig: Rig
     folder: Path
     robot: RobotTree | None = None
+    session: Session | None = None
     findings: list[Finding] = field(default_factory=list)
 
     @property
@@ -131,6 +145,8 @@ EXPORTS = {
     "fast_livo2": "other_tools:export_fast_livo2",
     "koide3": "other_tools:export_koide3",
     "opencv": "other_tools:export_opencv",
+    "mcap": "ros_bag:export_mcap",
+    "ply": "coloured_cloud:export_ply",
 }
 USUAL = ("extrinsics", "urdf", "camera_info", "static_tf")
 """What is written unless others are named."""
@@ -160,6 +176,7 @@ def export(
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
+    session: Session | None = None,
     robot: RobotTree | None = None,
     findings: list[Finding] | None = None,
 ) -> list[Path]:
@@ -174,6 +191,7 @@ def export(
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
         is_forced: write failed calibrations too; every file then says so.
+        session: with images and scans, for formats that show them.
         robot: its own tree of frames, into which the outputs are to fit.
         findings: gets those about content that is left out or in another form.
 
@@ -196,7 +214,7 @@ def export(
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
     told = [] if findings is None else findings
-    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, told)
+    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session, told)
     paths: list[Path] = []
     try:
         for exporter in exporters:
@@ -236,7 +254,7 @@ def remove_exports(folder: Path) -> None:
                 ) from error
 
 
-_SUFFIXES = (".yaml", ".urdf", ".txt", ".json", ".py")
+_SUFFIXES = (".yaml", ".urdf", ".txt", ".json", ".py", ".ply")
 _SIGN = b", written by lce-rig "
 _MOST_METADATA_BYTES = 1 << 20
 

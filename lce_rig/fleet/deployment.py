@@ -54,6 +54,7 @@ from lce_rig.fleet.releases import (
 from lce_rig.fleet.target import TargetSettings
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
+from lce_rig.session import Session
 
 _OTHER = "Another deployment came first. Run the same command again."
 
@@ -130,20 +131,21 @@ class Deployed:
     remarks: tuple[Finding, ...] = ()
 
 
-def plan(result: Path, rig: Rig, target: TargetSettings) -> Plan:
+def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
     """Compare a result with the state of a target; nothing is changed there.
 
     Args:
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
+        session: with images and scans, for formats that show them.
 
     Raises:
         SessionError: there is no result.
         TargetError: the target cannot be reached or read.
     """
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        return _plan(result, rig, target, Place(target), Path(folder))
+        return _plan(result, rig, target, session, Place(target), Path(folder))
 
 
 def deploy(
@@ -151,7 +153,7 @@ def deploy(
     rig: Rig,
     target: TargetSettings,
     *,
-    session: str = "SESSION",
+    session: Session | None = None,
     reason: str = "",
     place: Place | None = None,
 ) -> Deployed:
@@ -164,7 +166,7 @@ def deploy(
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
-        session: its path, for the commands of advice.
+        session: with images and scans, for formats that show them.
         reason: for deploying it against objections; it is written down there.
         place: another way to the target's folder than the target's own.
 
@@ -176,10 +178,11 @@ def deploy(
     """
     place = place or Place(target)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        planned = _plan(result, rig, target, place, Path(folder))
+        planned = _plan(result, rig, target, session, place, Path(folder))
         if planned.objections and not reason:
             causes = "; ".join(finding.text for finding in planned.objections)
-            advice = dict.fromkeys(finding.advice_at(session) for finding in planned.objections)
+            at = "SESSION" if session is None else str(session.path)
+            advice = dict.fromkeys(finding.advice_at(at) for finding in planned.objections)
             raise ResultRefusedError(f"not deployed to {target.to}: {causes}", "\n".join(advice))
         record, current = planned.record, planned.state.current
         if planned.is_in_place and current is not None:
@@ -264,10 +267,12 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     return Deployed(release, replaces, release.name != replaces, _run(place, target, release.name))
 
 
-def _plan(result: Path, rig: Rig, target: TargetSettings, place: Place, folder: Path) -> Plan:
+def _plan(
+    result: Path, rig: Rig, target: TargetSettings, session: Session | None, place: Place, folder: Path
+) -> Plan:
     """Write the new files to folder/new, fetch the current ones to folder/deployed, and compare."""
     new, deployed = folder / "new", folder / "deployed"
-    saved = _stage(result, rig, target, new)
+    saved = _stage(result, rig, target, session, new)
     state = _standing(place, deployed)
     files = content_of(new)
     before, after = _extrinsics(deployed), _extrinsics(new)
@@ -283,12 +288,14 @@ def _plan(result: Path, rig: Rig, target: TargetSettings, place: Place, folder: 
     return Plan(record, state, changed, tuple(sensors), tuple(findings))
 
 
-def _stage(result: Path, rig: Rig, target: TargetSettings, folder: Path) -> ResultFile:
+def _stage(
+    result: Path, rig: Rig, target: TargetSettings, session: Session | None, folder: Path
+) -> ResultFile:
     """Write the files of the set: result.json and the exports."""
     saved = read_result(result / RESULT)
     folder.mkdir()
     # A failed result is one of the objections, which are decided on together.
-    export(saved.pairs, rig, folder, formats=target.formats, is_forced=True)
+    export(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     return saved
 

@@ -183,7 +183,7 @@ class Result:
             return [RESULT], ()
         rig = self.session.rig
         findings: list[Finding] = []
-        files = export(usable, rig, folder, is_forced=force, findings=findings)
+        files = export(usable, rig, folder, is_forced=force, session=self.session, findings=findings)
         return [RESULT, *(str(path.relative_to(folder)) for path in files)], tuple(findings)
 
 

@@ -45,6 +45,8 @@ OutputFormat = Literal[
     "fast_livo2",
     "koide3",
     "opencv",
+    "mcap",
+    "ply",
 ]
 
 SWAPPED_SIDES = Kind(

@@ -63,16 +63,14 @@ def test_files_fit_into_the_robots_tree_and_what_is_left_out_is_told(lce_rig, ca
     robot.write_text(ROBOT)
     told = lce_rig("export", calibrated, "-o", out, "--formats", "autoware")
     assert told.code == 0 and told.err.count("export.no_frame") == 2  # each with its action
-    outcome = lce_rig(
-        "export", calibrated, "-o", out, "--formats", "urdf,ros2_launch,tf_static_bag", "--tree", robot
-    )
+    outcome = lce_rig("export", calibrated, "-o", out, "--formats", "urdf,ros2_launch,mcap", "--tree", robot)
     assert outcome.code == 0 and "export." not in outcome.err
-    assert {path.name for path in out.iterdir()} == {*("rles.urdf", "rles.launch.py", "tf_static")}
+    assert {path.name for path in out.iterdir()} == {*("rles.urdf", "rles.launch.py", "rles_session")}
     read = URDF.load(str(out / "rles.urdf"), load_meshes=False)
     T = read.get_transform("velodyne", "davis_optical_frame")
     np.testing.assert_allclose(T, extrinsics(calibrated), atol=1e-9)
-    # A bag of transforms is a tree as well.
-    args = ("--formats", "urdf", "--tree", out / "tf_static")
+    # The session's own recording of transforms is a tree as well.
+    args = ("--formats", "urdf", "--tree", out / "rles_session")
     assert lce_rig("export", calibrated, "-o", tmp_path / "again", *args).code == 0
     assert lce_rig("export", calibrated, "--into", robot, "--tree", robot).code == 2
 

@@ -18,11 +18,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from lce_rig.core.calibration import Calibration, Metrics
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export
 from lce_rig.export.other_tools import fit_lens
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.profile import Mount
+from lce_rig.session import Session
 from tests.saved_results import made_calibration
 
 Lens = tuple[str, Array, Array]
@@ -146,6 +148,19 @@ def _ros2_launch(case):
     return _published(case, [node["arguments"] for node in nodes])
 
 
+def _messages(path):
+    """Read all messages of an mcap file by topic."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    found = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
 def _joints(messages):
     joints = {}
     for each in messages[0].transforms:
@@ -224,6 +239,54 @@ def _opencv(case):
     return np.asarray(function(case.points_lidar[:, None], rvec, tvec, K, distortion)[0].reshape(-1, 2))
 
 
+def _mcap(case):
+    """Read transforms and camera model; images and points must be those of the session."""
+    name = f"{case.rig.name}_session"
+    found = _messages(case.folder / name / f"{name}.mcap")
+    (info,) = found[next(topic for topic in found if topic.endswith("/camera_info"))]
+    (projected,) = found[next(topic for topic in found if topic.endswith("/projected/compressed"))]
+    (cloud,) = (each for topic in found for each in found[topic] if hasattr(each, "point_step"))
+    (image,) = (each for topic in found for each in found[topic] if hasattr(each, "encoding"))
+    optical, lidar = case.frames
+    if (cloud.header.frame_id, image.header.frame_id, info.header.frame_id) != (lidar, optical, optical):
+        raise ValueError("messages in other frames")
+    if (info.header.stamp.sec, info.header.stamp.nanosec) != (
+        image.header.stamp.sec,
+        image.header.stamp.nanosec,
+    ):
+        raise ValueError("an image and its camera model of different times")
+    if not np.array_equal(np.frombuffer(image.data, np.uint8), session_image(case.rig, case.camera).ravel()):
+        raise ValueError("another image")
+    read = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_step)[:, :12].copy().view("<f4")
+    if not np.array_equal(read, case.points_lidar.astype(np.float32)):
+        raise ValueError("other points")
+    drawn = cv2.imdecode(np.frombuffer(projected.data, np.uint8), cv2.IMREAD_COLOR)
+    if drawn.shape[:2] != (info.height, info.width):
+        raise ValueError("a projected cloud of another size")
+    lens = "fisheye" if info.distortion_model == "equidistant" else "radtan", np.reshape(info.k, (3, 3))
+    T_cam_lidar = _chained(_joints(found["/tf_static"]), optical, lidar)
+    return project(case.points_lidar, T_cam_lidar, (*lens, np.array(info.d)))
+
+
+def _ply(case):
+    """Read positions and colours; a colour says from which pixel it was taken.
+
+    The image's blue and green are the column's and row's number. Where a colour is as the projection says,
+    the pixel is that of the projection; elsewhere it is the one that the colour names.
+    """
+    import open3d
+
+    cloud = open3d.t.io.read_point_cloud(str(case.folder / f"coloured_{case.camera}.ply"))
+    positions, colours = cloud.point.positions.numpy(), cloud.point.colors.numpy().astype(int)
+    wanted = project(case.points_lidar, case.calibration.T_cam_lidar, case.lens)
+    order = [int(np.abs(positions - p).sum(axis=1).argmin()) for p in case.points_lidar.astype(np.float32)]
+    if not np.array_equal(positions[order], case.points_lidar.astype(np.float32)):
+        raise ValueError("other points")
+    named = colours[order][:, [2, 1]]
+    nearest = np.round(wanted).astype(int)
+    return wanted + (named - nearest % 256)
+
+
 def probe_points(calibration, rig):
     """List points (N, 3) m, frame LiDAR, that cover the camera's image at 1 to 10 m."""
     intrinsics = rig.cameras[calibration.camera].to_intrinsics()
@@ -248,12 +311,23 @@ READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
     ("fast_livo2", "PyYAML, OpenCV"): _fast_livo2,
     ("koide3", "json, OpenCV"): _koide3,
     ("opencv", "cv::FileStorage"): _opencv,
+    ("mcap", "mcap, mcap-ros2-support"): _mcap,
+    ("ply", "Open3D"): _ply,
 }
 """By format and what reads it."""
 FITTED = {"kalibr": "radtan4", "fast_livo2": "radtan4", "koide3": "radtan5"}
 """Formats with fewer radtan coefficients than the profile may have."""
 MODELS = {"radtan": "k1 k2 p1 p2 k3", "fisheye": "equidistant", "rational": "k1 to k6"}
 """Kinds of lens, and their coefficients."""
+
+
+def session_image(rig, camera):
+    """Draw an image in which each pixel's blue, green and red are its column, its row (mod 256) and 7."""
+    width, height = rig.cameras[camera].resolution_px
+    image = np.full((height, width, 3), 7, np.uint8)
+    image[..., 0] = np.arange(width)[None, :] % 256
+    image[..., 1] = np.arange(height)[:, None] % 256
+    return image
 
 
 def outputs_case(rig_name, folder, *, model="radtan", seed=0):
@@ -289,9 +363,15 @@ def outputs_case(rig_name, folder, *, model="radtan", seed=0):
     )
     intrinsics = cameras[camera].to_intrinsics()
     lens = "fisheye" if model == "fisheye" else model, intrinsics.matrix, np.array(intrinsics.distortion)
-    points = probe_points(calibration, rig)
-    export([calibration], rig, folder / "out", formats=EXPORTS)
-    return Case(folder / "out", rig, calibration, points, lens)
+    points = probe_points(calibration, rig)[::3].astype(np.float32)  # 1 m away each: none hides another
+    with Session.create(folder / "session", rig) as session:
+        channel = next(iter(settings.channels))
+        zeros = np.zeros(len(points), np.float32)
+        scan = Scan(lidar, 10**18, points, zeros, (np.arange(len(points)) % 16).astype(np.int16), None)
+        image = Image(camera, channel, 10**18 + 5, session_image(rig, camera))
+        session.add_capture([image], [scan], {})
+        export([calibration], rig, folder / "out", formats=EXPORTS, session=session)
+    return Case(folder / "out", rig, calibration, points.astype(np.float64), lens)
 
 
 def off_px(case, name, reader):

@@ -82,6 +82,17 @@ def draw_overlay(
     return picture
 
 
+def draw_projection(
+    image: Image, scan: Scan, intrinsics: Intrinsics, T_cam_lidar: Array, limits_m: tuple[float, float]
+) -> Picture:
+    """Project a whole scan, coloured by range, into the image at its own size, without title and legend."""
+    picture = np.array(
+        image.pixels if image.pixels.ndim == 3 else np.repeat(image.pixels[..., None], 3, axis=2)
+    )
+    _draw_scan(picture, 1, scan, intrinsics, T_cam_lidar, limits_m, max(1.0, 1.6e-3 * picture.shape[1]))
+    return picture
+
+
 def draw_edges(
     image: Image, edges: DepthEdges, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
 ) -> Picture:
