@@ -9,6 +9,7 @@ import numpy as np
 
 import lce_rig as lce
 from lce_rig.cli import show
+from lce_rig.cli.contents import put_aside
 from lce_rig.cli.options import (
     cameras_option,
     path_option,
@@ -89,6 +90,12 @@ def _uncertainty(c: Calibration) -> Iterator[str]:
 )
 @robot_option
 @click.option(
+    "--without",
+    callback=split_names,
+    metavar="CAPTURE[,CAPTURE]",
+    help="Reject these captures first, as `captures --reject` does; --restore there takes them back.",
+)
+@click.option(
     "--rig",
     "profile",
     metavar="FILE",
@@ -106,6 +113,7 @@ def calibrate(
     channels: list[str] | None,
     name: str | None,
     robot: str | None,
+    without: list[str] | None,
     profile: str | None,
     explain: bool,
     as_json: bool,
@@ -125,6 +133,8 @@ def calibrate(
     result_folder(Path(), name, is_new=True)
     if profile is not None:
         _take_profile(session, profile)
+    if without:
+        put_aside(session, without, "calibrate --without")
     opened = lce.Session.open(session)
     rig = opened.rig = opened.rig.of_robot(robot)
     serials_of(opened)

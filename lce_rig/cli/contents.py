@@ -87,6 +87,19 @@ def captures(
         show.note(f"made from other captures: result {names}. Run `lce-rig calibrate {session}` again")
 
 
+def put_aside(session: Path, names: Sequence[str], reason: str) -> None:
+    """Reject captures by name; those that are rejected already stay so.
+
+    Raises:
+        UsageError: a name is not that of a capture. Then none is rejected.
+    """
+    with lce.Session.open(session, writable=True) as opened:
+        rejecting = _full(names) - {capture.name for capture in opened.rejected}
+        _require_there(opened, rejecting, set())
+        for name in sorted(rejecting):
+            opened.reject(name, reason)
+
+
 def _full(names: Iterable[str]) -> set[str]:
     """Give captures' names with their leading zeros, which may be omitted."""
     stripped = map(str.strip, names)

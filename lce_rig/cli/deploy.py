@@ -29,6 +29,7 @@ from lce_rig.pipeline.result_files import result_folder
 @result_option("Deploy")
 @click.option("--robot", metavar="NAME", help="Name the robot, for a target that stands for many.")
 @click.option("--dry-run", is_flag=True, help="Print the changes; change nothing.")
+@click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print the releases at the target; change nothing.")
 @click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
@@ -42,6 +43,7 @@ def deploy(
     name: str | None,
     robot: str | None,
     dry_run: bool,
+    diff: bool,
     status: bool,
     rollback: bool,
     release: str | None,
@@ -61,6 +63,8 @@ def deploy(
     """
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
+    if diff and not dry_run:
+        raise UsageError("--diff applies to --dry-run only", "Add --dry-run.")
     if release is not None and not rollback:
         raise UsageError("--release applies to --rollback only", "Add --rollback.")
     if force and not reason.strip():
@@ -82,7 +86,7 @@ def deploy(
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)
-        _show_plan(plan, target, as_json=as_json)
+        _show_plan(plan, target, has_diff=diff, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
@@ -100,7 +104,7 @@ def _print_json(target: TargetSettings, **content: Any) -> None:
     show.print_json({"format_version": 1, "to": target.to, **content})
 
 
-def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
+def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: bool) -> None:
     if as_json:
         _print_json(
             target,
@@ -111,6 +115,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
             sensors=plan.sensors,
             objections=plan.objections,
             remarks=plan.remarks,
+            **({"diff": plan.diff} if has_diff else {}),
         )
         return
     current = plan.state.current
@@ -130,6 +135,8 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
         show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
+    for line in plan.diff if has_diff else ():
+        click.echo(line)
 
 
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}

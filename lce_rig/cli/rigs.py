@@ -52,14 +52,15 @@ def list_profiles() -> None:
 
 @rigs.command("show")
 @click.argument("rig_name", metavar="RIG")
+@click.option("--all", "is_whole", is_flag=True, help="Print settings that have their default, too.")
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
-def show_profile(rig_name: str, as_json: bool) -> None:
-    """Print the profile RIG, a name or a file, as YAML with every setting, defaults too."""
+def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
+    """Print the profile RIG, a name or a file, as YAML without settings that have their default."""
     rig = load_rig(rig_name)
     if as_json:
         show.print_json(rig.model_dump(mode="json"))
         return
-    click.echo(dump_rig(rig), nl=False)
+    click.echo(dump_rig(rig, is_whole=is_whole), nl=False)
     show.warn_of(rig.warnings())
 
 

@@ -4,6 +4,7 @@
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
+import difflib
 import json
 import shutil
 from collections.abc import Mapping
@@ -86,6 +87,7 @@ class Plan:
         changed: files that differ from the current release's: "changed", "missing", "added".
         sensors: changes of the extrinsics.
         findings: objections, and notes of what could not be compared.
+        diff: lines in which texts differ, as `diff -u` prints them.
     """
 
     record: ReleaseRecord
@@ -93,6 +95,7 @@ class Plan:
     changed: Mapping[str, str]
     sensors: tuple[SensorChange, ...]
     findings: tuple[Finding, ...]
+    diff: tuple[str, ...]
 
     @property
     def objections(self) -> tuple[Finding, ...]:
@@ -285,7 +288,20 @@ def _plan(
     changed = differences(files, {} if state.current is None else state.current.files)
     findings = _compare(saved, target, state.current)
     record = ReleaseRecord.of(saved, files, state)
-    return Plan(record, state, changed, tuple(sensors), tuple(findings))
+    lines = [line for name in changed for line in _diff(name, deployed, new)]
+    return Plan(record, state, changed, tuple(sensors), tuple(findings), tuple(lines))
+
+
+def _diff(name: str, deployed: Path, new: Path) -> list[str]:
+    """Lines in which a text differs; new and removed texts whole, other files not at all."""
+    try:
+        before, after = (
+            path.read_text("utf-8").splitlines() if path.is_file() else []
+            for path in (deployed / name, new / name)
+        )
+    except (OSError, ValueError):
+        return []
+    return list(difflib.unified_diff(before, after, f"deployed/{name}", f"new/{name}", lineterm=""))
 
 
 def _stage(

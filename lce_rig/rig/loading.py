@@ -107,9 +107,26 @@ def parse_rig(text: str, source: str = "profile") -> Rig:
     return rig_from_document(read_document(text, source))
 
 
-def dump_rig(rig: Rig) -> str:
-    """Write every setting of a rig as YAML, without comments; `parse_rig` returns an equal rig."""
-    return dump_yaml(rig.model_dump(mode="json", exclude_none=True))
+def dump_rig(rig: Rig, *, is_whole: bool = True) -> str:
+    """Write a rig as YAML, without comments; `parse_rig` returns an equal rig.
+
+    Args:
+        rig: the profile.
+        is_whole: whether to write settings that have their default, too; models always are.
+    """
+    whole = rig.model_dump(mode="json", exclude_none=True)
+    if is_whole:
+        return dump_yaml(whole)
+    return dump_yaml(_changed(whole, rig.model_dump(mode="json", exclude_none=True, exclude_defaults=True)))
+
+
+def _changed(whole: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
+    """Keep models and what is in `changed`, which has the same blocks."""
+    return {
+        key: _changed(value, changed[key]) if isinstance(value, dict) and key in changed else value
+        for key, value in whole.items()
+        if key in changed or key == "model"
+    }
 
 
 def dump_yaml(data: Mapping[str, Any], width: float = 100) -> str:

@@ -34,9 +34,10 @@ def test_deploy_dry_run_status_and_rollback(lce_rig, calibrated_once, targets, t
     dry = lce_rig(*words(calibrated_once, targets, "--dry-run"))
     assert dry.code == 0 and len(dry.out.splitlines()) <= 3
     targets.write_text(targets.read_text().replace("{to: robot}", "{to: robot, formats: [urdf]}"))
-    changed = lce_rig(*words(calibrated_once, targets, "--dry-run")).out.splitlines()
-    assert any("0.000 deg, 0.0 mm" in line for line in changed)
-    assert any("removed: " in line and "extrinsics.yaml" in line for line in changed)
+    diff = lce_rig(*words(calibrated_once, targets, "--dry-run", "--diff")).out.splitlines()
+    assert any("0.000 deg, 0.0 mm" in line for line in diff)
+    assert {line[:4] for line in diff if line.endswith("/extrinsics.yaml")} == {"--- ", "+++ "}
+    assert lce_rig(*words(calibrated_once, targets, "--diff")).code == 2
     assert lce_rig(*words(calibrated_once, targets, "--rollback")).code == 8
 
 

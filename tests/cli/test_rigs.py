@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.rig import load_rig
+from lce_rig.rig import find_profile, load_rig
 from tests.shared import files_up_to
 
 
@@ -18,11 +18,21 @@ def test_called_bare_it_lists_the_profiles(capsys):
     assert capsys.readouterr().out == out
 
 
-def test_show_prints_a_profile_with_every_setting_that_loads_again(capsys, tmp_path):
+def test_show_prints_what_is_not_default_and_with_all_everything(capsys, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"{find_profile('rles').read_text(encoding='utf-8')}\nquality: {{min_rings: 7}}\n")
+    assert run(["rigs", "show", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "  min_rings: 7\n" in out and "min_points" not in out and "model: VLP-16" in out
+    assert run(["rigs", "show", str(path), "--all"]) == 0
+    assert "min_points" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("more", [[], ["--all"]])
+def test_show_prints_a_profile_that_loads_again(capsys, tmp_path, more):
     path = tmp_path / "copy.yaml"
-    assert run(["rigs", "show", "rlfs"]) == 0
+    assert run(["rigs", "show", "rlfs", *more]) == 0
     path.write_text(capsys.readouterr().out, encoding="utf-8")
-    assert "min_points" in path.read_text(encoding="utf-8")
     assert load_rig(path) == load_rig("rlfs")
     assert run(["rigs", "show", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["board"]["square_m"] == 0.07

@@ -49,6 +49,16 @@ def test_a_result_fits_twelve_lines_of_a_terminal_and_explains_itself_if_asked(l
     assert len(lce_rig("calibrate", calibrated, "--explain").out.splitlines()) > 12
 
 
+def test_without_rejects_captures_before_it_calibrates(lce_rig, calibrated):
+    assert lce_rig("calibrate", calibrated, "--without", "4,99").code == 2
+    assert not (calibrated / "rejected").exists()
+    for _ in range(2):
+        assert lce_rig("calibrate", calibrated, "--without", "4,000007", "--no-report").code == 0
+    used = read(calibrated / "calibration" / "result.json")["pairs"][0]["captures_used"]
+    assert len(used) == 14 and not {"000004", "000007"} & set(used)
+    assert lce_rig("calibrate", calibrated, calibrated, "--without", "1").code == 2
+
+
 @pytest.mark.long
 def test_the_result_names_its_robot_sensors_and_date(lce_rig, session):
     words = ("calibrate", session, "--robot", "kestrel", "--name", "named")

@@ -71,8 +71,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
         pair["steps"] = _next_steps(c, folder, has_previous)
         pair["rejecting"] = ""
         for worst in pair["gallery"][:1]:
-            name = shlex.quote(folder)
-            pair["rejecting"] = f"lce-rig captures {name} --reject {worst['name']}\nlce-rig calibrate {name}"
+            pair["rejecting"] = f"lce-rig calibrate {shlex.quote(folder)} --without {worst['name']}"
         pairs.append(pair)
     facts = [(name, value) for name, value in facts if value]
     return render("calibration.html", rig=session.rig.name, pairs=pairs, facts=facts)

@@ -46,5 +46,5 @@ def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(on
     shown = re.findall(r'alt="Capture ([^"]+)"', text)
     assert sorted(shown) == sorted(r.capture for r in residuals)
     assert shown[0] == residuals[3].capture
-    assert f"--reject {shown[0]}" in text
+    assert f"--without {shown[0]}" in text
     assert text.count("data:image/jpeg") == len(residuals)
