@@ -8,6 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, path_option
+from lce_rig.core.data import join_events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.phrasing import significant
@@ -23,6 +24,8 @@ STAMPS = "stamps.csv"
 _MAX_IMAGES = 1_000_000
 # Enough for the network to settle before the first requested image.
 _WARM_UP_NS = 1_500_000_000
+# In so much of a recording lamps show whether they flicker.
+_FIRST_NS = 1_000_000_000
 
 
 @click.command()
@@ -56,7 +59,9 @@ def reconstruct(
     """
     reconstructor = Reconstructor()
     events = open_events(recording, topic=topic)
-    if is_flickering(events.read(events.start_ns, events.start_ns + 1_000_000_000)):
+    start_ns = events.start_ns
+    first = list(takewhile(lambda part: part.t_ns[0] < start_ns + _FIRST_NS, events))
+    if is_flickering(join_events(first).between(start_ns, start_ns + _FIRST_NS)):
         show.warn(f"{recording.name}: {IMAGE_FLICKER.refusal().sentence}")
     stamps_ns = _stamps(recording, events, start, duration, every)
     files, refused = _write(output, reconstructor, events, stamps_ns)

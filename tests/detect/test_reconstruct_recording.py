@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, join_events
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.io.events import open_events
 
@@ -48,8 +48,7 @@ def homography_residual_px(found):
 
 def whole(recording):
     """Read the recording in one piece."""
-    first_ns, last_ns = recording.span_ns
-    return recording.read(first_ns, last_ns + 1)
+    return join_events(list(recording))
 
 
 def judged(events):

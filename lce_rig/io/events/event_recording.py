@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -88,7 +87,7 @@ class EventRecording:
     """Events of one camera from one file or topic.
 
     Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
-    them in memory; it may be done again and again. `read` cuts out a window. Timestamps are the sensor's own.
+    them in memory; it may be done again and again. Timestamps are the sensor's own.
 
     Attributes:
         path: the file or folder.
@@ -175,21 +174,6 @@ class EventRecording:
                     yield self._to_events(on_sensor)
         finally:
             self._losses.keep_more(losses)
-
-    def read(self, start_ns: int, end_ns: int) -> Events:
-        """Read the events with start_ns <= t < end_ns, device time; there may be none.
-
-        Raises:
-            SourceError: as iterating does.
-        """
-        parts = [self._to_events(NO_EVENTS)]
-        for stretch in self:
-            if stretch.t_ns[-1] >= start_ns:
-                parts.append(stretch.between(start_ns, end_ns))
-            if stretch.t_ns[-1] >= end_ns:
-                break
-        # Arrival is known of a stretch's first event, not of a window's.
-        return replace(join_events(parts), host_ns=None)
 
     def _to_events(self, columns: EventColumns) -> Events:
         """Add the camera's name and resolution."""

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.io.events.event_recording import REORDER_NS, EventRecording, EventStream
-from tests.io.events.encoders import random_events
 from tests.notes import has_note
 
 PATH = Path("recording.test")
@@ -97,24 +96,6 @@ def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many():
     assert has_note(recording.notes, "1 events", "off", "column 2000")
     with pytest.raises(SourceError, match="346x260"):
         list(record(replace(stretch, x=many)))
-
-
-@given(
-    windows=st.lists(st.tuples(st.integers(-100, 6000), st.integers(0, 3000)), min_size=1, max_size=8),
-    n_parts=st.integers(1, 40),
-)
-def test_windows_hold_what_lies_between_their_ends_in_any_order(windows, n_parts):
-    events = random_events(2000, 5)
-    whole = EventColumns(events.t_ns, events.x, events.y, events.polarity)
-    cuts = np.array_split(np.arange(2000), n_parts)
-    recording = record(*(whole.select(slice(int(c[0]), int(c[-1]) + 1)) for c in cuts))
-    for start_us, length_us in windows:
-        start_ns, end_ns = start_us * 1000, (start_us + length_us) * 1000
-        window = recording.read(start_ns, end_ns)
-        inside = (events.t_ns >= start_ns) & (events.t_ns < end_ns)
-        assert window.t_ns.tolist() == events.t_ns[inside].tolist()
-        assert window.x.tolist() == events.x[inside].tolist()
-        assert (window.width_px, window.height_px, window.sensor) == (346, 260, "events")
 
 
 def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least():
