@@ -264,7 +264,7 @@ def _judge_camera(
     (speed_mps, unsteady_m), events_px = motion, event_quality(recent, stamp_ns, outline).events_px
     limits = rig.quality
     if speed_mps > limits.max_board_speed_mps:
-        return too_fast(speed_mps, limits)
+        return too_fast(speed_mps, limits.max_board_speed_mps)
     is_slow = speed_mps < _MIN_SPEED_MPS
     needed_px = max(_PLENTY_EVENTS_PX if is_slow else 0.0, limits.min_events_px)
     if events_px < needed_px:

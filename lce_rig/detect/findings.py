@@ -179,9 +179,6 @@ IMAGE_TURNING = Kind(
     "the board turned at {turn_deg_s:.0f} deg/s during the scan (limit {max_turn_deg_s:g} deg/s)",
     "turn it less, move it sideways only",
 )
-IMAGE_SMEARED = Kind(
-    "image.smeared", "the board moved {smear_m:mm} during the scan (limit {max_smear_m:mm})", _SLOWER
-)
 LIDAR_NO_RETURNS = Kind(
     "lidar.no_returns",
     "{n_points} points, none of them finite and farther than {min_range_m:g} m",

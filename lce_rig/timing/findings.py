@@ -21,8 +21,7 @@ AMBIGUOUS_PULSES = Kind(
 PULSES_NOT_FOLLOWED = Kind(
     "pulses.not_followed", "its images do not follow the pulses", "set the camera to trigger mode"
 )
-BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count")
-CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
+RESTARTED = Kind("pulses.restarted", "the camera or the sync board restarted its count")
 SLIPPED = note_kind(
     "pulses.slipped",
     "its images were matched to the pulses anew {n_restarts} times; {n_matched} matched, {n_unmatched} not",

@@ -94,7 +94,7 @@ class TriggerMatcher:
         if pulse.count <= last_count:
             if self._pulses.get(pulse.count) == pulse.stamp_ns:
                 return []
-            self._restart(findings.BOARD_RESTARTED)
+            self._restart(findings.RESTARTED)
             self._pulses.clear()
         elif (n_steps := pulse.count - last_count) <= _MAX_STEPS:
             # Pulses whose lines were lost lie between their neighbours.
@@ -116,7 +116,7 @@ class TriggerMatcher:
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
                 return []
-            self._restart(findings.CAMERA_RESTARTED)
+            self._restart(findings.RESTARTED)
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()

@@ -124,7 +124,6 @@ def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(st
     ("limit", "code", "figure"),
     [
         ({"max_board_speed_mps": 0.05}, "image.too_fast", "max_speed_mps"),
-        ({"max_smear_m": 1e-3}, "image.smeared", "max_smear_m"),
         ({"min_events_px": 1e3}, "image.hardly_moved", "min_events_px"),
         ({"min_event_sharpness": 50.0}, "image.not_sharp", "min_sharpness"),
         ({"min_event_contrast": 300.0}, "image.low_contrast", "min_contrast"),
@@ -136,6 +135,11 @@ def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code,
     if isinstance(board, ImageBoard):
         board = gate_event_board(detection[1], limits)
     assert (board.code, board.figures[figure]) == (code, *limit.values())
+
+
+def test_a_board_that_moves_far_during_its_scan_of_20_ms_is_too_fast(detection):
+    board = gate_event_board(detection[1], LIMITS.model_copy(update={"max_smear_m": 1e-3}))
+    assert board.code == "image.too_fast" and board.figures["max_speed_mps"] == pytest.approx(0.05)
 
 
 def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):

@@ -23,7 +23,6 @@ from lce_rig.detect.findings import (
     IMAGE_FLICKER,
     IMAGE_HARDLY_MOVED,
     IMAGE_HOT_PIXELS,
-    IMAGE_SMEARED,
     IMAGE_TOO_FAST,
     IMAGE_TURNING,
 )
@@ -151,17 +150,17 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
         return IMAGE_HARDLY_MOVED.refusal(events_px=q.events_px, min_events_px=limits.min_events_px)
     # Comparisons with a figure that is not known are false.
     if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
-        return too_fast(q.speed_mps, limits)
+        return too_fast(q.speed_mps, limits.max_board_speed_mps)
     if q.turn_deg_s - 2 * q.turn_sigma_deg_s > limits.max_turn_deg_s:
         return IMAGE_TURNING.refusal(turn_deg_s=q.turn_deg_s, max_turn_deg_s=limits.max_turn_deg_s)
     if q.smear_m > limits.max_smear_m:
-        return IMAGE_SMEARED.refusal(smear_m=q.smear_m, max_smear_m=limits.max_smear_m)
+        return too_fast(q.speed_mps, q.speed_mps * limits.max_smear_m / q.smear_m)
     return found
 
 
-def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
+def too_fast(speed_mps: float, max_speed_mps: float) -> Refusal:
     """Refuse a board that moves faster than the profile allows."""
-    return IMAGE_TOO_FAST.refusal(speed_mps=speed_mps, max_speed_mps=limits.max_board_speed_mps)
+    return IMAGE_TOO_FAST.refusal(speed_mps=speed_mps, max_speed_mps=max_speed_mps)
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
