@@ -50,11 +50,6 @@ _CAPTURES, _DURATION_S = 30, 20.0
     help=f"Set the recording's duration [default: {_DURATION_S:g}]; simulating 1 s takes about 10 s.",
 )
 @click.option(
-    "--ros",
-    type=click.Choice(["1", "2"]),
-    help="Write the recording's bag for ROS 1 [default] or ROS 2 (mcap).",
-)
-@click.option(
     "--seed",
     default=0,
     show_default=True,
@@ -80,7 +75,6 @@ def simulate(
     captures: int | None,
     recording: Path | None,
     duration: float | None,
-    ros: str | None,
     seed: int,
     mounting: int | None,
     motion: Literal["still", "moving"] | None,
@@ -101,8 +95,8 @@ def simulate(
                 "looking along its x axis; it may see few of the boards"
             )
     if recording is None:
-        if duration is not None or ros is not None:
-            raise UsageError("--duration and --ros apply to recordings only", "Add --recording FOLDER.")
+        if duration is not None:
+            raise UsageError("--duration applies to recordings only", "Add --recording FOLDER.")
         kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
         usual: Literal["still", "moving"] = "moving" if kinds == {"events"} else "still"
         options = replace(SimulationOptions.for_rig(rig.name, motion or usual), mounting_seed=mounting)
@@ -116,7 +110,7 @@ def simulate(
     if motion == "still":
         raise UsageError("--motion still: the board moves in a recording", "Omit --motion, or --recording.")
     options = replace(SimulationOptions.for_rig(rig.name, "moving"), mounting_seed=mounting)
-    _simulate_recording(recording, rig, rig_name, duration or _DURATION_S, seed, options, int(ros or 1))
+    _simulate_recording(recording, rig, rig_name, duration or _DURATION_S, seed, options)
 
 
 def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options: SimulationOptions) -> None:
@@ -141,10 +135,10 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
 
 
 def _simulate_recording(
-    folder: Path, rig: Rig, profile: str, duration_s: float, seed: int, options: SimulationOptions, ros: int
+    folder: Path, rig: Rig, profile: str, duration_s: float, seed: int, options: SimulationOptions
 ) -> None:
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
-    with BagRecorder.in_folder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
+    with BagRecorder.in_folder(folder, rig) as recorder, show.progress_bar("simulating, s") as progress:
         write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
         for sample in recording:
             recorder.write(sample)

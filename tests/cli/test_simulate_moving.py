@@ -97,7 +97,6 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig, tmp_path):
     "words",
     [
         ("s", "--duration", "3"),
-        ("s", "--ros", "2"),
         ("s", "--recording", "r"),
         ("--captures", "3", "--recording", "r"),
         ("--motion", "still", "--recording", "r"),
@@ -116,19 +115,19 @@ def recorded(tmp_path_factory):
     """A quarter of a second as files."""
     folder = tmp_path_factory.mktemp("recorded")
     profile = write_profile(folder, "frames", "events")
-    words = ["--rig", profile, "--recording", folder / "r", "--duration", 0.25, "--seed", 2, "--ros", 2]
+    words = ["--rig", profile, "--recording", folder / "r", "--duration", 0.25, "--seed", 2]
     assert run(["simulate", *map(str, words)]) == 0
     return folder / "r"
 
 
 def test_a_recording_is_read_by_the_readers_of_recordings(recorded, rig):
-    assert sorted(path.name for path in recorded.iterdir()) == ["recording", "truth.json"]
-    recording = open_recording(recorded / "recording", rig)
+    assert sorted(path.name for path in recorded.iterdir()) == ["recording.bag", "truth.json"]
+    recording = open_recording(recorded / "recording.bag", rig)
     samples = list(recording.samples())
     assert sum(isinstance(sample, Image) for sample in samples) == 5
     assert sum(isinstance(sample, Scan) for sample in samples) == 2
     size = rig.cameras["davis"].resolution_px
-    events = list(open_events(recorded / "recording", sensor="davis", resolution=size))
+    events = list(open_events(recorded / "recording.bag", sensor="davis", resolution=size))
     assert sum(map(len, events)) > 1000
     assert sum(len(sample) for sample in samples if isinstance(sample, Events)) == sum(map(len, events))
 
