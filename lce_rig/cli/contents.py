@@ -167,6 +167,7 @@ def results(session: Path, as_json: bool) -> None:
                 "is_outdated": result.is_outdated,
                 "problem": result.problem or None,
                 "date": None if result.file is None else result.file.provenance.date,
+                "imported": None if result.file is None else result.file.provenance.imported,
                 "pairs": [] if result.file is None else [_pair(c) for c in result.file.pairs],
             }
             for result in stored
@@ -176,9 +177,9 @@ def results(session: Path, as_json: bool) -> None:
     show.print_parts(_tables(stored))
     if not stored:
         show.say(f"no results in {session}: run `lce-rig calibrate {session}`")
-    dates = dict.fromkeys(result.file.provenance.date or "unknown" for result in stored if result.file)
-    if dates:
-        show.note(f"date of the captures: {'; '.join(dates)}")
+    dates = {result.file.provenance.date_words: None for result in stored if result.file}
+    if any(dates):
+        show.note(f"date of the captures: {'; '.join(filter(None, dates))}")
     for result in stored:
         if result.problem:
             show.warn(result.problem)

@@ -495,6 +495,13 @@ def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, 
     return pair
 
 
+_Time = Annotated[
+    Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None,
+    # Earlier versions wrote "" for a time that is not known.
+    BeforeValidator(lambda time: time or None),
+]
+
+
 @dataclass(frozen=True)
 class Provenance:
     """Where a result comes from; a field is empty where it is not known.
@@ -505,16 +512,19 @@ class Provenance:
         date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted; None
             where the recording tells no time.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
+        imported: when the last capture came into the session, in the same form; only where `date` is None.
     """
 
     robot: str = ""
     serials: Mapping[str, str] = field(default_factory=dict)
-    date: Annotated[
-        Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None,
-        # Earlier versions wrote "" for a time that is not known.
-        BeforeValidator(lambda time: time or None),
-    ] = None
+    date: _Time = None
     session_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
+    imported: _Time = None
+
+    @property
+    def date_words(self) -> str:
+        """The date, or "unknown, imported on 2026-11-23" where the recording tells none; "" for neither."""
+        return self.date or (f"unknown, imported on {self.imported[:10]}" if self.imported else "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -334,7 +334,7 @@ def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord |
             findings.append(DEPLOY_OLDER(date=origin.date, there=current.date))
     elif origin.session_sha256 != current.session_sha256:
         there = current.date or "unknown"
-        findings.append(DEPLOY_UNDATED(date=origin.date or "unknown", there=there))
+        findings.append(DEPLOY_UNDATED(date=origin.date_words or "unknown", there=there))
     return findings
 
 

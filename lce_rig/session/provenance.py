@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import SessionError
 from lce_rig.rig import Rig
 from lce_rig.session.capture import Capture
-from lce_rig.session.session import Session
+from lce_rig.session.session import CAPTURED, Session
 
 # Timestamps before 2000 count from somewhere else than 1970, most often from when the sensor was switched on.
 _FIRST_UTC_NS = 946_684_800 * 10**9
@@ -24,11 +24,19 @@ def provenance_of(session: Session) -> Provenance:
     Raises:
         SessionError: two units of one sensor took the captures.
     """
+    date, imported = date_of(session), []
+    # When a capture came into the session, by its journal.
+    for entry in [] if date else session.read_journal():
+        if entry.get("event") == CAPTURED:
+            with suppress(TypeError, ValueError, OverflowError):
+                time = datetime.fromisoformat(str(entry.get("time")))
+                imported.append(time.astimezone(timezone.utc))
     return Provenance(
         robot=session.rig.robot or "",
         serials=serials_of(session),
-        date=date_of(session),
+        date=date,
         session_sha256=content_sha256(session),
+        imported=_in_utc(max(imported)) if imported else None,
     )
 
 
@@ -65,9 +73,11 @@ def date_of(session: Session) -> str | None:
     """
     times_ns = [time_ns for capture in _readable(session.captures) for time_ns in capture.times_ns]
     in_utc = [time_ns for time_ns in times_ns if _FIRST_UTC_NS <= time_ns < _LAST_UTC_NS]
-    if not in_utc:
-        return None
-    return datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return _in_utc(datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc)) if in_utc else None
+
+
+def _in_utc(time: datetime) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def content_sha256(session: Session) -> str:

@@ -44,6 +44,8 @@ PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 PROFILE_TEXT = "profile.yaml"
 """The profile as its author wrote it, with comments; rig.yaml holds every value, and is what is read."""
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
+CAPTURED = "captured"
+"""The journal's event of a capture."""
 # The keys of a profile by which captures are read.
 _OF_CAPTURES = ("name", "robot", "board", "cameras", "lidars")
 CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
@@ -343,7 +345,7 @@ class Session:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         contents.setdefault(Capture(folder).content_sha256, name)
-        self.journal("captured", capture=name)
+        self.journal(CAPTURED, capture=name)
         return name
 
     def add_session(self, other: "Session") -> list[str]:

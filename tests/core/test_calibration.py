@@ -138,10 +138,10 @@ def test_an_array_that_is_not_finite_is_refused(name, bad):
         as_text(calibration(**{name: array}))
 
 
-@pytest.mark.parametrize("date", ["2026-11-20T10:22:03Z", None])
-def test_provenance_and_hashes_of_inputs_are_read_back(tmp_path, date):
+@pytest.mark.parametrize("times", [("2026-11-20T10:22:03Z", None), (None, "2026-11-20T10:22:03Z")])
+def test_provenance_and_hashes_of_inputs_are_read_back(tmp_path, times):
     path = tmp_path / "result.json"
-    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, date, "0f" * 32)
+    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, times[0], "0f" * 32, times[1])
     inputs = {"rig.yaml": "0f" * 32, "captures/000000/meta.json": "a1" * 32}
     path.write_text(result_file("rles", [calibration()], inputs, origin).text())
     read = read_result(path)

@@ -35,7 +35,7 @@ def test_what_captures_tell_and_what_the_profile_states_come_together(fill, rig,
     found = provenance_of(fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"}))
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
     # Of the last capture's scan, 10**18 ns and its seed.
-    assert found.date == "2001-09-09T01:46:40Z"
+    assert (found.date, found.imported) == ("2001-09-09T01:46:40Z", None)
 
 
 def test_two_units_of_one_sensor_are_no_result(fill, rig, tmp_path):
@@ -71,7 +71,7 @@ def test_the_fingerprint_changes_with_inputs_only(fill, rig, samples, tmp_path):
     assert content_sha256(Session.open(tmp_path / "f")) not in hashes
 
 
-def test_a_session_without_times_has_no_date(rig, samples, tmp_path):
+def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(rig, samples, tmp_path):
     with Session.create(tmp_path / "a", rig) as session:
         images, scans = samples(1)
         # A clock that counts from the sensor's start tells no date.
@@ -80,7 +80,14 @@ def test_a_session_without_times_has_no_date(rig, samples, tmp_path):
             [replace(scan, stamp_ns=5 * 10**9, host_ns=None) for scan in scans],
             {},
         )
-    assert provenance_of(Session.open(tmp_path / "a")).date is None
+    session = Session.open(tmp_path / "a")
+    written = next(entry["time"] for entry in session.read_journal() if entry["event"] == "captured")
+    origin = provenance_of(session)
+    assert (origin.date, origin.imported) == (None, f"{written[:19]}Z")
+    assert written[:10] in origin.date_words
+    (tmp_path / "a" / "journal.jsonl").unlink()
+    origin = provenance_of(session)
+    assert (origin.date, origin.imported, origin.date_words) == (None, None, "")
 
 
 def test_a_robot_is_named_later_and_not_renamed(rig, tmp_path, samples):

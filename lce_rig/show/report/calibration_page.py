@@ -52,7 +52,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
     facts = [
         ("rig", file.rig),
         ("robot", origin.robot),
-        ("date of the captures", origin.date or "unknown"),
+        ("date of the captures", origin.date_words),
         *((f"serial number of {name}", serial) for name, serial in sorted(origin.serials.items())),
         ("method", ", ".join(dict.fromkeys(c.method for c in file.pairs))),
         ("made by", file.made_by),
