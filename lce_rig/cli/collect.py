@@ -17,10 +17,21 @@ from lce_rig.collect.live.guide import predict
 from lce_rig.collect.offline import collect as collect_into
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
+from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import SourceOptions
 from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
+
+
+def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    topics = {}
+    for value in values:
+        sensor, separator, topic = value.partition("=")
+        if not (sensor and separator and topic):
+            raise click.BadParameter(f"{value!r} is not SENSOR=/topic, such as cam=/camera/image_raw")
+        topics[sensor] = topic
+    return topics
 
 
 @click.command()
@@ -42,6 +53,14 @@ from lce_rig.session.identity import MARKER
     "RAW, HDF5), or beside these a folder of images named after their times. "
     "Repeatable, also for simultaneous recordings of several sensors.",
     multiple=True,
+)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    callback=_topics,
+    metavar="SENSOR=/TOPIC",
+    help="Set the topic of a sensor in a bag; repeatable.",
 )
 @click.option(
     "--camera",
@@ -99,6 +118,7 @@ def collect(
     robot: str | None,
     session: Path,
     paths: tuple[Path, ...],
+    topics: dict[str, str],
     cameras: tuple[str, ...],
     channels: tuple[str, ...],
     lidars: tuple[str, ...],
@@ -145,12 +165,14 @@ def collect(
         _one_for_each(paths, "--lidar", lidars, rig.lidars),
         strict=True,
     )
-    sources = [SourceOptions(*names) for names in sensors]
+    sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
     with show.progress_bar("collecting") as progress, Session.resume(session, rig) as writer:
         report = collect_into(writer, recordings, n_wanted, progress)
     _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
+    if topics and any(isinstance(recording, FolderRecording) for recording in recordings):
+        show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:
         hold_s = ceil(stillness_window_s(rig))
@@ -174,7 +196,7 @@ def _keep_text(session: Path, rig_name: str | None) -> None:
 
 
 _MOST_CAUSES = 5
-_OF_RECORDINGS = ("cameras", "channels", "lidars")
+_OF_RECORDINGS = ("topics", "cameras", "channels", "lidars")
 
 
 def _one_for_each(

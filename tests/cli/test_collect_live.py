@@ -24,7 +24,7 @@ TWO_LIDARS = str(Path(__file__).parents[1] / "rigs" / "two_lidars.yaml")
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--channel", "frames"], "--channel"),
+        (["--topic", "cam=/x"], "--topic"),
         (["--from", "somewhere", "--hold", "3"], "--hold"),
         (["--from", "somewhere", "--simulated"], "--simulated"),
         (["--from", "somewhere", "--preview"], "--preview"),

@@ -130,7 +130,7 @@ def choose_topics(
             take(target, topic, f", the only topic with {what}")
             continue
         fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}"
-        hint = f"{there}. Set topic of {target} in the profile."
+        hint = f"{there}. Say which with --topic {target}=TOPIC, or set topic in the profile."
         failures.append(SourceError(f"{path}: {fault} for {target}", hint))
     if failures and not (options.is_part and chosen):
         raise failures[0]
