@@ -169,7 +169,7 @@ def _correction(q: Mapping[str, Figure]) -> str:
 
 
 def _intrinsics(finding: Finding) -> str:
-    """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
+    """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}."""
     q = finding.figures
     if finding.severity == "note":
         return f"boards correct intrinsics{_correction(q) or ' slightly'}"
@@ -179,14 +179,8 @@ def _intrinsics(finding: Finding) -> str:
         reason = "they project to no pixels where boards were seen"
     elif correction:
         reason = f"off{correction}"
-    elif q["is_visible"]:
-        reason = fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)
-    elif q["is_focal_off"]:
-        percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
-        reason = f"focal length {abs(percent):.1f} +- {sigma:.1f} % {'larger' if percent > 0 else 'smaller'}"
     else:
-        seen = fill("intrinsics fit to {displacement_px:.1f} px where boards were seen, ", q)
-        return seen + "but not in all parameters together"
+        reason = fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)
     return f"intrinsics {fit}: {reason}"
 
 
@@ -346,9 +340,8 @@ PLATE_EDGE = Kind(
 INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,
-    "if rough or changed: " + _SAVE,
+    "if rough, changed or refocused: " + _SAVE,
     actions={
-        "refocused": "if rough or refocused: " + _SAVE,
         "collect": "cover the corners, then " + _SAVE,
         "weighed": "use the result's, or " + _SAVE,
     },

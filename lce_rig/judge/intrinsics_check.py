@@ -43,8 +43,6 @@ _CHANCE = 0.002
 _BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
 _TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
 _N_FOLDS = 2
-# Residuals that exceed the possible ones by this much are visible.
-_VISIBLE = 1.2
 # Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
 # large as the profile's error where boards were seen, within these limits.
 _KNOWN_PX = (1.0, 5.0)
@@ -72,10 +70,6 @@ class IntrinsicsCheck:
         displacement_deg: the same as an angle.
         turn_deg: that rotation, which is an error of extrinsics under the given intrinsics.
         turn_sigma_deg: standard deviation of that.
-        focal_ratio: fitted over given focal length.
-        focal_sigma: standard deviation of that.
-        chance: probability of a difference this large if the given intrinsics are right; None if the models
-            are of different families.
         covered: share of the image in which boards were seen.
         image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
         surprise, is_contradicted: of the fitted intrinsics, as in `IntrinsicsEstimate`.
@@ -89,9 +83,6 @@ class IntrinsicsCheck:
     displacement_deg: float
     turn_deg: float
     turn_sigma_deg: float
-    focal_ratio: float
-    focal_sigma: float
-    chance: float | None
     covered: float
     image_sigma_px: float
     surprise: float | None = None
@@ -105,7 +96,7 @@ class IntrinsicsCheck:
         """
         # Noise alone displaces pixels; only the excess counts.
         noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
-        bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_bent else 0.0
+        bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_displaced else 0.0
         turned = self.turn_deg if self.is_turned else 0.0
         if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
             return "fail"
@@ -113,24 +104,14 @@ class IntrinsicsCheck:
         return "marginal" if is_marginal or self.is_contradicted else "pass"
 
     @property
-    def is_bent(self) -> bool:
-        """Whether pixels are significantly displaced, by their displacement or by all parameters together."""
-        return self.is_displaced or (self.chance is not None and self.chance < _CHANCE)
-
-    @property
     def is_displaced(self) -> bool:
-        """Whether the displacement of pixels alone is significant."""
+        """Whether pixels are significantly displaced."""
         return self.displacement_px > self._sure * self.displacement_sigma_px
 
     @property
     def is_turned(self) -> bool:
         """Whether the camera is significantly rotated."""
         return self.turn_deg > self._sure * self.turn_sigma_deg
-
-    @property
-    def is_focal_off(self) -> bool:
-        """Whether the focal length differs significantly."""
-        return abs(self.focal_ratio - 1) > self._sure * self.focal_sigma
 
     @property
     def _sure(self) -> float:
@@ -170,8 +151,6 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
         intrinsics: the intrinsics to check, at the same resolution.
         board: the board.
     """
-    from scipy.special import fdtrc
-
     given_px = distances_under(intrinsics, fitted.views, board)
     corners_px = fitted.corners_px
     difference = compare_lenses(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
@@ -179,19 +158,9 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
     angle = float(np.linalg.norm(turn))
     along = turn / max(angle, 1e-12)
     given_focal = np.sqrt(intrinsics.fx_px * intrinsics.fy_px)
-    by_focal = np.zeros(fitted.model.size)
-    by_focal[:2] = 0.5 / given_focal
     certainty = certainty_of(fitted.intrinsics, corners_px, fitted.cov, fitted.model)
-    n_captures, chance = len({view.capture for view in fitted.views}), None
-    with suppress(ValueError):
-        # All parameters at once by the F distribution, as the deviations come from few captures.
-        change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
-        scale = 1.0 / fitted.sigma
-        correlation = fitted.cov * np.outer(scale, scale)
-        chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
-        chance = float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
     return IntrinsicsCheck(
-        n_captures=n_captures,
+        n_captures=len({view.capture for view in fitted.views}),
         rms_px=float(np.sqrt(np.mean(given_px**2))),
         possible_px=fitted.rms_px if np.isnan(fitted.held_out_rms_px) else fitted.held_out_rms_px,
         displacement_px=difference.rms_px,
@@ -199,9 +168,6 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
         displacement_deg=float(np.degrees(difference.rms_px / given_focal)),
         turn_deg=float(np.degrees(angle)),
         turn_sigma_deg=float(np.degrees(np.sqrt(along @ difference.cov_turn @ along))),
-        focal_ratio=float(np.sqrt(fitted.intrinsics.fx_px * fitted.intrinsics.fy_px) / given_focal),
-        focal_sigma=float(np.sqrt(by_focal @ fitted.cov @ by_focal)),
-        chance=chance,
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
         surprise=fitted.surprise,
@@ -253,13 +219,10 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     figures: dict[str, Any] = {
         **asdict(check),
         **judgement.figures,
-        "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
         "is_displaced": check.is_displaced,
         "is_turned": check.is_turned,
-        "is_focal_off": check.is_focal_off,
     }
-    action = "refocused" if check.is_focal_off else ""
-    severity = failing(check.verdict(target_deg) == "fail")
+    severity, action = failing(check.verdict(target_deg) == "fail"), ""
     if check.surprise is not None:
         # The result has the fitted intrinsics; only a lens that is hardly the profile's is a doubt.
         severity = "warning" if check.surprise > _OTHER_LENS else "note"

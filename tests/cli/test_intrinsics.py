@@ -54,8 +54,7 @@ def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
     assert camera["judgement"]["code"] in ("intrinsics.better", "intrinsics.undetermined")
     profile_record = camera["profile"]
     assert profile_record["verdict"] in ("marginal", "fail")
-    off = profile_record["focal_ratio"] - 349.57 / 363.5
-    assert abs(off) < 3 * profile_record["focal_sigma"] < 0.03
+    assert profile_record["displacement_px"] > 1.0
 
 
 @pytest.mark.parametrize(

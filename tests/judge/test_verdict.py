@@ -231,7 +231,7 @@ def test_intrinsics_that_fit_few_images_come_before_captures_of_another_mounting
     moved_apart = Contrast(
         "before", "after", turned, 0.0, ("000018", "000019"), "last", "000017", is_rejected=True
     )
-    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1, is_visible=True)
+    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1)
     examination = replace(examined(estimate), contrasts=(moved_apart,))
     verdict, findings = judge(estimate, examination, RIG, "cam", "lidar", 20, [lens], None, n_misfits)
     assert (verdict, findings[0].code) == ("fail", first)

@@ -252,9 +252,6 @@ def test_stale_intrinsics_fail_with_their_figures(views, kind):
     found = explain(check)
     assert (found.code, found.severity) == ("verdict.intrinsics", "error")
     assert found.figures["displacement_px"] == check.displacement_px
-    if kind == "two per cent longer":
-        assert check.focal_ratio == pytest.approx(1 / 1.02, abs=4 * check.focal_sigma)
-        assert found.action == "refocused"
     if kind == "centre ten pixels off":
         assert check.turn_deg == pytest.approx(np.degrees(10 / 450), rel=0.25)
         assert found.figures["is_turned"] and found.figures["turn_deg"] == check.turn_deg
@@ -295,21 +292,18 @@ def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views)
 def test_a_displacement_of_pixels_within_its_noise_is_not_stated_as_one(views):
     check = check_intrinsics(views, replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px), BOARD)
     assert explain(check).figures["is_displaced"]
-    within = replace(check, displacement_px=0.3, displacement_sigma_px=0.5, turn_deg=0.0, focal_ratio=1.0)
-    within = replace(within, chance=1e-6, rms_px=0.1, possible_px=0.1, surprise=40.0, is_contradicted=True)
+    within = replace(check, displacement_px=0.3, displacement_sigma_px=0.5, turn_deg=0.0)
+    within = replace(within, rms_px=0.1, possible_px=0.1, surprise=40.0, is_contradicted=True)
     found = explain(within)
-    assert within.is_bent and not found.figures["is_displaced"]
+    assert not found.figures["is_displaced"]
     assert found.severity == "warning" and "+-" not in found.text
 
 
 @pytest.mark.dataset
 @pytest.mark.parametrize(
-    ("recording", "profile", "worst_focal_error"),
-    [("rlfs01", "rlfs", 0.003), ("sss_noise15mm", "sss", 0.001), ("rles01_lf", "rles", 0.01)],
+    ("recording", "profile"), [("rlfs01", "rlfs"), ("sss_noise15mm", "sss"), ("rles01_lf", "rles")]
 )
-def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(
-    recordings, recording, profile, worst_focal_error
-):
+def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(recordings, recording, profile):
     rig = load_rig(profile)
     (camera,) = rig.cameras.values()
     lens, board = camera.to_intrinsics(), rig.board.to_board()
@@ -321,8 +315,6 @@ def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(
             seen.append(BoardView(path.stem, "frames", found))
     check = check_intrinsics(seen, lens, board)
     assert check.verdict() == "pass"
-    assert abs(check.focal_ratio - 1) < worst_focal_error
     assert check.possible_px < 0.06
     longer = check_intrinsics(seen, replace(lens, fx_px=1.02 * lens.fx_px, fy_px=1.02 * lens.fy_px), board)
     assert longer.verdict() != "pass"
-    assert longer.focal_ratio == pytest.approx(check.focal_ratio / 1.02, rel=1e-3)
