@@ -262,6 +262,8 @@ def _agree(finding: Finding) -> str:
         "{rotation_deg:3deg} and {translation_m:1mm}",
         finding.figures,
     )
+    if not finding.figures["are_independent"]:
+        return f"{apart}; common errors stay hidden, as they share captures"
     if finding.figure("p") < _UNLIKELY:
         return f"{apart}, more than their standard deviations predict (chance {finding.figure('p'):.2f})"
     how = "less than" if finding.figures["is_generous"] else "as"
@@ -446,23 +448,14 @@ ELSEWHERE = Kind(
     "in {n_elsewhere} of {n_captures} captures the scan has no surface where the extrinsics place the board",
 )
 UNSEEN = Kind("verify.unseen", "both sensors detect the board in no capture")
-RESULTS_AGREE = Kind(
-    "results.agree",
-    "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} and "
-    "{translation_m:1mm}; common errors stay hidden, as they share captures",
-    severity="note",
-)
-RESULTS_DISAGREE = Kind(
-    "results.disagree",
-    "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} and "
-    "{translation_m:1mm}, more than their uncertainties allow",
-    "compare their overlays: `lce-rig verify {session} --name NAME`",
-)
 REPEAT_AGREE = Kind("repeat.agree", _agree, severity="note")
 REPEAT_DISAGREE = Kind(
     "repeat.disagree",
     "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
     "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
     "do not use any of them until the cause is known",
-    actions={"odd_one": "find the fault in {odd_one}, without it the others agree"},
+    actions={
+        "odd_one": "find the fault in {odd_one}, without it the others agree",
+        "overlays": "compare the overlays of {first} and {second}: `lce-rig verify {session} --name NAME`",
+    },
 )

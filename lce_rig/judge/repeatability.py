@@ -18,7 +18,7 @@ from lce_rig.core.geometry import (
     mean_pose,
     tangent_sizes,
 )
-from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
+from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE
 from lce_rig.judge.reach import as_used, covariance_alone
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
@@ -118,13 +118,11 @@ class Repeatability:
             "translation_m": self.max_translation_m,
             "p": self.p,
         }
-        if not self.are_independent:
-            worst = min(self.differences, key=lambda pair: pair.p)
-            figures |= {"first": worst.first, "second": worst.second}
-            return RESULTS_AGREE(**figures) if self.agrees else RESULTS_DISAGREE(**figures)
         if self.agrees:
             return REPEAT_AGREE(is_generous=self.p > _GENEROUS, **figures)
-        action = "" if self.odd_one is None else "odd_one"
+        action = "overlays" if not self.are_independent else "" if self.odd_one is None else "odd_one"
+        worst = min(self.differences, key=lambda pair: pair.p)
+        figures |= {"first": worst.first, "second": worst.second}
         return REPEAT_DISAGREE(action=action, ratio=self.ratio, odd_one=self.odd_one, **figures)
 
 

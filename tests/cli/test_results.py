@@ -46,7 +46,7 @@ def test_results_of_one_session_are_compared_with_a_bound_that_holds_for_any_cor
     assert outcome.code == 0, outcome.err
     (pair,) = json.loads(outcome.out)["pairs"]
     assert pair["sessions"] == ["current", "paper"] and not pair["are_independent"] and pair["agrees"]
-    assert pair["finding"]["code"] == "results.agree"
+    assert pair["finding"]["code"] == "repeat.agree"
     T = [
         np.array(json.loads((two_results / folder / "result.json").read_text())["pairs"][0]["T_cam_lidar"])
         for folder in ("calibration", "results/paper")
@@ -63,7 +63,7 @@ def test_results_that_contradict_each_other_exit_with_7(lce_rig, two_results):
     path.write_text(json.dumps(document))
     outcome = lce_rig("repeat", two_results, "--json")
     assert outcome.code == 7
-    assert json.loads(outcome.out)["pairs"][0]["finding"]["code"] == "results.disagree"
+    assert json.loads(outcome.out)["pairs"][0]["finding"]["code"] == "repeat.disagree"
 
 
 def test_results_without_their_captures_and_unreadable_ones_are_listed_as_such(lce_rig, two_results):
