@@ -17,13 +17,13 @@ from lce_rig.detect.lidar.template import (
     PlaneView,
     beams_about,
     plane_axes,
-    rate,
     register,
     view_plane,
 )
 
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
+_MAD = 1.4826  # the standard deviation of normal noise over its median size
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
 
@@ -121,8 +121,7 @@ def measure_size(
     axis = over.argmax(axis=1)
     rows = np.arange(len(axis))
     sign = np.where(local[rows, axis] < 0, -1.0, 1.0)
-    gap_local = placement.local(ends.gap + [placement.u_m, placement.v_m])
-    step_m = np.abs(gap_local[rows, axis])
+    step_m = np.abs((ends.gap @ placement.axes.T)[rows, axis])
     half = np.asarray(placement.half_m)
     # Unknowns: shift along x and y, angle, half width, half height.
     jacobian = np.zeros((len(axis), 5))
@@ -136,7 +135,7 @@ def measure_size(
     x = np.zeros(5)
     for _ in range(6):
         residual = target - jacobian @ x
-        scale = max(median(np.abs(residual[usable])) * 1.4826, 0.003) if usable.any() else 0.01
+        scale = max(median(np.abs(residual[usable])) * _MAD, 0.003) if usable.any() else 0.01
         weight = usable * np.maximum(1 - (residual / (4.7 * np.maximum(scale, sigma_m))) ** 2, 0.0) ** 2
         information = (jacobian * (weight / sigma_m**2)[:, None]).T @ jacobian + prior
         x = np.linalg.solve(information, jacobian.T @ (weight / sigma_m**2 * target))
@@ -150,10 +149,10 @@ def measure_size(
     if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
         # The ends contradict each other and do not determine the size.
         return placement, np.full(2, SIZE_PRIOR_M), target, step_m
-    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    shift_u_m, shift_v_m = (x[:2] @ placement.axes).tolist()
     fitted = Placement(
-        placement.u_m + float(cosine * x[0] - sine * x[1]),
-        placement.v_m + float(sine * x[0] + cosine * x[1]),
+        placement.u_m + shift_u_m,
+        placement.v_m + shift_v_m,
         placement.angle_rad + float(x[2]),
         (float(half[0] + x[3]), float(half[1] + x[4])),
         placement.error_m,
@@ -195,20 +194,24 @@ class Beam:
         return self.aperture_m + np.array([self.divergence_rad, upright_rad]) * distance_m
 
 
-def fit_plane_to_ranges(points: Array, start: Array, scale_m: float) -> Array:
+def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple[Array, float]:
     """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
 
     The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
-    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales.
+    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales of
+    the returns' scatter about the first plane.
 
     Args:
         points: (N, 3) m, frame lidar.
         start: (4,) plane as (n, d).
-        scale_m: noise of a range.
+        distance_m: of the plate's middle.
 
     Returns:
-        (4,) plane as (n, d), n towards the LiDAR.
+        (4,) plane as (n, d), n towards the LiDAR, and a robust standard deviation of the returns from it, m.
     """
+    height_m = points @ start[:3] + start[3]
+    scale_m = _MAD * median(np.abs(height_m - median(height_m))) + 0.001
+    scale_m *= distance_m / start[3]
     range_m = np.linalg.norm(points, axis=1)
     rays = points / range_m[:, None]
     m = -start[:3] / start[3]
@@ -219,7 +222,8 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float) -> Array:
         jacobian = -rays * (predicted**2)[:, None]
         hessian = (jacobian * weight[:, None]).T @ jacobian
         m = m + np.linalg.solve(hessian + 1e-9 * np.eye(3), jacobian.T @ (weight * residual))
-    return np.asarray(np.append(-m, 1.0) / np.linalg.norm(m))
+    plane = np.append(-m, 1.0) / np.linalg.norm(m)
+    return plane, _MAD * median(np.abs(points @ plane[:3] + plane[3]))
 
 
 def refine(
@@ -238,7 +242,7 @@ def refine(
         plane: (4,) first guess.
         centre: (3,) m, the point of the plane the placement is counted from.
         placement: first guess of the outline.
-        limit_m: largest error of an outline; what is far worse is not improved further.
+        limit_m: largest error of an outline; what is worse is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
         dark_m: as in the view.
 
@@ -253,20 +257,13 @@ def refine(
         centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
         placement = replace(placement, u_m=0.0, v_m=0.0)
         view = view_plane(scan.points, near, plane, centre, radius_m, tolerance_m, dark_m)
-        if k == 0:
-            error_m = rate(scan, view, placement)
-            if error_m > 2.0 * limit_m:
-                return view, replace(placement, error_m=error_m)
         away = placement.distance_m(view.uv[view.is_on])
         on = view.member[view.is_on][away < 0.0]
         if len(on) < 10 or (k == 0 and np.count_nonzero(away > SLACK_M) > max_beyond * len(on)):
             return None
         points = scan.points[on].astype(np.float64)
-        height = points @ plane[:3] + plane[3]
-        scale_m = 1.4826 * median(np.abs(height - median(height))) + 0.001
-        plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
-        height = points @ plane[:3] + plane[3]
-        tolerance_m = 3.5 * 1.4826 * median(np.abs(height)) + 0.004
+        plane, spread_m = fit_plane_to_ranges(points, plane, float(np.linalg.norm(centre)))
+        tolerance_m = 3.5 * spread_m + 0.004
         view = view_plane(scan.points, near, plane, view.origin, radius_m, tolerance_m, dark_m)
         registered = register(scan, view, placement)
         if registered is None:

@@ -110,8 +110,7 @@ def fit_outline(
         if np.count_nonzero(near & rays.is_on) < 10:
             return None
         local = local[near]
-        cosine, sine = np.cos(x[2]), np.sin(x[2])
-        blur = np.maximum(blur_m(np.array([[cosine, sine], [-sine, cosine]])), least)
+        blur = np.maximum(blur_m(placement.axes), least)
         p, slopes = _probability(local, half + x[3:], blur)
         is_on = rays.is_on[near]
         # By u, v, angle and growth; the shift is counted along the rectangle's axes.
@@ -123,7 +122,7 @@ def fit_outline(
         information = J @ (J / (p * (1 - p))).T + prior
         step = np.linalg.solve(information + 1e-3 * np.eye(5), score)
         step *= min(1.0, 0.05 / max(float(np.abs(step[:2]).max()), 1e-9))
-        x = x + [cosine * step[0] - sine * step[1], sine * step[0] + cosine * step[1], *step[2:]]
+        x = x + [*(step[:2] @ placement.axes), *step[2:]]
         if k > len(annealed_m) and np.abs(step).max() < 1e-4:
             break
     cost = float(np.mean(-np.log(np.where(is_on, p, 1 - p))))
@@ -174,8 +173,7 @@ def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]
     near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
     near = near.select(thin(len(near.uv), _SMEAR_RAYS))
     local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
-    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
-    beam_m = blur_m(np.array([[cosine, sine], [-sine, cosine]]))
+    beam_m = blur_m(placement.axes)
     smears = []
     for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0])):
         ps = (_probability(local, half, np.hypot(beam_m, smear * axis))[0] for smear in _SMEARS_M)
@@ -228,9 +226,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
 
     placement = outline.placement
     half = np.array(placement.half_m) + outline.growth_m
-    local = placement.local(rays.uv)
-    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
-    axes = np.array([[cosine, sine], [-sine, cosine]])
+    local, axes = placement.local(rays.uv), placement.axes
     parts = []
     for axis in (0, 1):
         length = 2 * (half[1 - axis] - _CORNER_M)

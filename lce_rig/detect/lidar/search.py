@@ -21,7 +21,7 @@ from lce_rig.detect.findings import (
     LIDAR_TOUCHING,
 )
 from lce_rig.detect.lidar.measurement import Beam, build_board, refine
-from lce_rig.detect.lidar.plates import propose_plates, screen_plates
+from lce_rig.detect.lidar.plates import Plates, propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import (
     Placement,
@@ -63,7 +63,7 @@ class Limits:
     def widened(self, sigma_m: float) -> "Limits":
         """Allow for the noise that a scan shows."""
         template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
-        return replace(self, template_m=template_m, rms_m=plane_limit_m(self.rms_m, sigma_m))
+        return replace(self, template_m=template_m, rms_m=self.rms_m + 1.5 * sigma_m)
 
 
 STANDARD = Limits()
@@ -126,6 +126,18 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
     misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
     misfit[plates.n_rings < 3] += 1.0
+    return nearest_plate(plates, misfit, board, limits)
+
+
+def nearest_plate(plates: Plates, misfit: Array, board: Board, limits: Limits) -> Refusal:
+    """Refuse a scan by the plate whose size is nearest to the board's, or because none is near to it.
+
+    Args:
+        plates: K of them.
+        misfit: (K,) sum of |log| of the ratios of long and short side.
+        board: the board searched for.
+        limits: of the search.
+    """
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
         return other_plate(plates.size_m[best], float(np.linalg.norm(plates.centre[best])), board)
@@ -149,11 +161,6 @@ PATCH_SHARE = 0.20
 # Beyond this incidence dark squares may return nothing; so many of the beams on the board must be lost.
 GRAZING_RAD = np.radians(35.0)
 LOST_SHARE = 0.10
-
-
-def plane_limit_m(rms_m: float, sigma_m: float) -> float:
-    """Return the largest rms distance of returns from a plane: a limit without noise, and the noise."""
-    return rms_m + 1.5 * sigma_m
 
 
 def find_lidar_boards(
@@ -337,14 +344,19 @@ def look_for_board(
         near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
     nearby = scan.select(near[(np.abs(away[:, near].T @ rotation) <= half).all(axis=1)])
     found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
-    if not isinstance(found, Refusal):
-        distance_m = float(np.linalg.norm(T_lidar_board[:3, 3]))
-        return next(
-            (candidate for candidate in found if _is_at(candidate, T_lidar_board)),
-            LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=distance_m),
-        )
-    cause = at_once if isinstance(at_once, Refusal) else found
-    return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
+    return board_at(found, T_lidar_board, at_once if isinstance(at_once, Refusal) else None)
+
+
+def board_at(
+    found: list[LidarBoard] | Refusal, T_lidar_board: Array, cause: Refusal | None = None
+) -> LidarBoard | Refusal:
+    """Choose the board that lies where a pose (4, 4) has it; or refuse, by a cause or that of the search."""
+    if isinstance(found, Refusal):
+        cause = cause or found
+        return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
+    distance_m = float(np.linalg.norm(T_lidar_board[:3, 3]))
+    nothing = LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=distance_m)
+    return next((candidate for candidate in found if _is_at(candidate, T_lidar_board)), nothing)
 
 
 def _measure_at(

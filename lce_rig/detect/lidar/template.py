@@ -55,7 +55,7 @@ class PlaneView:
 
     def pose_of(self, placement: "Placement") -> Array:
         """Build T_lidar_board (4, 4) of a placed board; y points upwards where that is left open."""
-        direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+        direction = placement.axes[0]
         x = self.axes @ (-direction if direction[0] < 0 else direction)
         normal = self.plane[:3]
         R = np.stack([x, np.cross(normal, x), normal], axis=1)
@@ -80,11 +80,15 @@ class Placement:
     half_m: tuple[float, float]
     error_m: float = np.inf
 
+    @property
+    def axes(self) -> Array:
+        """Unit vectors of the width and the height in the plane view, the rows of (2, 2)."""
+        cosine, sine = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        return np.array([[cosine, sine], [-sine, cosine]])
+
     def local(self, uv: Array) -> Array:
         """Take points (..., 2) of the plane view to the rectangle's axes, m."""
-        cosine, sine = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        offset = uv - [self.u_m, self.v_m]
-        return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]))
+        return np.asarray((uv - [self.u_m, self.v_m]) @ self.axes.T)
 
     def distance_m(self, uv: Array) -> Array:
         """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
@@ -211,15 +215,6 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
     state, error_m = _search(guess, samples[None], kind[None], start.half_m, (0.04, 0.03, 0.03, 0.03))
     u_m, v_m, angle_rad = (float(x) for x in state[0])
     return Placement(u_m, v_m, angle_rad, start.half_m, float(error_m[0]))
-
-
-def rate(scan: OrderedScan, view: PlaneView, placement: Placement) -> float:
-    """Compute `Placement.error_m` of a placement as it stands; infinite where no ring shows the plate."""
-    samples, kind = _samples(scan, view, placement)
-    if not (kind == END).any():
-        return float("inf")
-    state = np.array([[[placement.u_m, placement.v_m, placement.angle_rad]]])
-    return float(_cost(state, samples[None], kind[None], placement.half_m)[0, 0])
 
 
 def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Array, Indices]:

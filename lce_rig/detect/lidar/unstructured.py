@@ -13,10 +13,7 @@ from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.findings import (
     LIDAR_HIDDEN,
     LIDAR_NO_BORDER,
-    LIDAR_NO_PLATE,
     LIDAR_NO_RETURNS,
-    LIDAR_NOT_WHERE_EXPECTED,
-    LIDAR_NOTHING_WHERE_EXPECTED,
     LIDAR_OUT_OF_VIEW,
     LIDAR_SMEARED,
     LIDAR_TOO_FEW_POINTS,
@@ -37,18 +34,17 @@ from lce_rig.detect.lidar.outline import (
 )
 from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
-    LOOK_TURN,
-    MARGIN_M,
-    MAX_SIZE_MISFIT,
     STANDARD,
     TOUCHING_SHARE,
     Limits,
+    board_at,
     distinct_boards,
+    nearest_plate,
     other_plate,
     too_thick,
 )
-from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD
-from lce_rig.detect.lidar.template import Placement, PlaneView, view_plane
+from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Floats
+from lce_rig.detect.lidar.template import Placement, PlaneView, plane_axes, view_plane
 
 # Cells per short side of the board: of 6 cm for a plate of 0.63 m.
 _CELLS = 10.0
@@ -109,7 +105,7 @@ def find_unstructured_boards(
     misfit = np.abs(np.log(np.maximum(ratio, 1e-3))).sum(axis=1)
     can_be = np.flatnonzero((ratio > [0.5, 0.35]).all(axis=1) & (ratio < [2.2, 1.9]).all(axis=1))
     found: list[LidarBoard] = []
-    misses: list[tuple[float, Refusal]] = []
+    misses: list[Refusal] = []
     for k in can_be[np.argsort(misfit[can_be])][:_MOST_PATCHES]:
         if found and misfit[k] > _ALIKE:
             break
@@ -117,16 +113,10 @@ def find_unstructured_boards(
         if isinstance(measured, LidarBoard):
             found.append(measured)
         else:
-            misses.append((float(misfit[k]), measured))
+            misses.append(measured)
     if found:
         return distinct_boards(found, board)
-    if misses:
-        return min(misses, key=lambda miss: miss[0])[1]
-    if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
-        best = int(np.argmin(misfit))
-        return other_plate(patches.size_m[best], float(np.linalg.norm(patches.centre[best])), board)
-    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
-    return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
+    return misses[0] if misses else nearest_plate(patches, misfit, board, limits)
 
 
 def _too_few(n_points: int, distance_m: float, min_points: int = _MIN_POINTS) -> Refusal:
@@ -136,25 +126,22 @@ def _too_few(n_points: int, distance_m: float, min_points: int = _MIN_POINTS) ->
 def look_for_unstructured_board(
     scan: Scan, board: Board, T_lidar_board: Array, limits: Limits = STANDARD
 ) -> LidarBoard | Refusal:
-    """Find the board about a predicted pose (4, 4), such as an image and extrinsics give."""
-    centre, normal = T_lidar_board[:3, 3], T_lidar_board[:3, 2]
-    is_far = np.linalg.norm(scan.points, axis=1) >= limits.min_range_m
-    returns = np.column_stack([scan.points, scan.intensity])[is_far].astype(np.float64)
-    away = returns[:, :3] - centre
-    reach_m = np.hypot(board.width_m, board.height_m) / 2 + MARGIN_M
-    is_near = (np.linalg.norm(away, axis=1) < reach_m) & (np.abs(away @ normal) < MARGIN_M)
-    patches = grow_patches(returns[is_near, :3], min(board.width_m, board.height_m) / _CELLS)
-    cause: Refusal | None = None
-    for k in range(min(len(patches.centre), 3)):
-        if abs(patches.plane[k, :3] @ normal) > LOOK_TURN:
-            measured = measure_unstructured(returns, board, patches.plane[k], centre, limits)
-            if isinstance(measured, Refusal):
-                cause = cause or measured
-            elif np.linalg.norm(measured.T_lidar_board[:3, 3] - centre) < MARGIN_M:
-                return measured
-    if cause is not None:
-        return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
-    return LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre)))
+    """Find the board about a predicted pose (4, 4), such as an image and extrinsics give.
+
+    The plates are searched in the cone of rays about the board.
+    """
+    about = _rays_about(scan.points, T_lidar_board[:3, 3], board)
+    nearby = find_unstructured_boards(scan.select(about), board, replace(limits, max_range_m=np.inf))
+    return board_at(nearby, T_lidar_board)
+
+
+def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[np.bool_]:
+    """Find which rays (N,) pass the board's middle so closely that they may tell where it ends."""
+    reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + _SURROUND_M
+    squared_cosine = 1.0 / (1.0 + (reach_m / np.linalg.norm(centre)) ** 2)
+    along = points @ (centre / np.linalg.norm(centre)).astype(points.dtype)
+    squared_m2 = np.einsum("ij,ij->i", points, points)
+    return np.asarray((along > 0) & (along**2 > squared_cosine * squared_m2))
 
 
 def grow_patches(points: Array, cell_m: float) -> Plates:
@@ -249,12 +236,10 @@ class _View(PlaneView):
         at = self.origin + uv @ self.axes.T
         range_m = np.linalg.norm(at, axis=1, keepdims=True)
         ray = at / range_m
-        level = np.column_stack([-ray[:, 1], ray[:, 0], np.zeros(len(ray))])
-        level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
         along = normals @ self.axes.T
         turn = np.sum(along * ray, axis=1) / (ray @ self.plane[:3])
         sideways = along - turn[:, None] * self.plane[:3]
-        across = np.stack([np.sum(sideways * axis, axis=1) for axis in (level, np.cross(ray, level))], axis=1)
+        across = np.einsum("ki,kij->kj", sideways, plane_axes(ray))
         squares = (across * self.beam.widths_m(range_m) / 2) ** 2
         return np.asarray(squares / np.sqrt(np.maximum(squares.sum(axis=1, keepdims=True), 1e-18)))
 
@@ -269,8 +254,7 @@ class _View(PlaneView):
 
     def growth_m(self, placement: Placement) -> tuple[Array, float]:
         """Predict by how much half width and half height of a plate seem larger, and how well it is known."""
-        cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
-        expected = self.half_beam_m(np.array([[cosine, sine], [-sine, cosine]]))
+        expected = self.half_beam_m(placement.axes)
         return expected, float(expected.max()) / 2 + 0.005
 
     def rays(self, half_m: tuple[float, float], placement: Placement | None = None) -> Rays:
@@ -312,8 +296,7 @@ def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array,
     cell = cell[((cell >= 0) & (cell < n)).all(axis=1)]
     is_hit = np.bincount(cell[:, 0] * n[1] + cell[:, 1], minlength=int(n.prod())).reshape(n) > 0
     empty = np.argwhere(~maximum_filter(is_hit, 3))
-    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
-    at = ((empty + 0.5 - n / 2) * cell_m) @ np.array([[cosine, sine], [-sine, cosine]])
+    at = ((empty + 0.5 - n / 2) * cell_m) @ placement.axes
     return at + [placement.u_m, placement.v_m], cell_m
 
 
@@ -333,11 +316,7 @@ def measure_unstructured(
     if plane[3] < np.cos(MAX_INCIDENCE_RAD) * distance_m:
         return LIDAR_TURNED.refusal(max_turn_deg=float(np.degrees(MAX_INCIDENCE_RAD)), distance_m=distance_m)
     half_m = (board.width_m / 2, board.height_m / 2)
-    reach_m = 1.4 * float(np.hypot(*half_m)) + _SURROUND_M
-    cosine = 1.0 / np.hypot(1.0, reach_m / distance_m)
-    along = returns[:, :3] @ (centre / distance_m)
-    squared_m2 = np.einsum("ij,ij->i", returns[:, :3], returns[:, :3])
-    returns = returns[(along > 0) & (along**2 > cosine**2 * squared_m2)]
+    returns = returns[_rays_about(returns[:, :3], centre, board)]
     returns = returns[thin(len(returns), _MOST_MEASURED)]
     view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * _NOISE_M, limits)
     n_on = int(np.count_nonzero(view.is_on))
@@ -359,9 +338,7 @@ def measure_unstructured(
         if outline is None or np.count_nonzero(inside) < _MIN_POINTS:
             return _too_few(int(np.count_nonzero(inside)), distance_m)
         on_plate = view.returns[:, :3][inside]
-        scale_m = 1.4826 * median(np.abs(view.height_m[inside] - median(view.height_m[inside]))) + 0.001
-        plane = fit_plane_to_ranges(on_plate, view.plane, scale_m * distance_m / view.plane[3])
-        spread_m = 1.4826 * median(np.abs(on_plate @ plane[:3] + plane[3]))
+        plane, spread_m = fit_plane_to_ranges(on_plate, view.plane, distance_m)
         tolerance_m = min(max(3.5 * spread_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
         centre = view.origin + view.axes @ [outline.placement.u_m, outline.placement.v_m]
         view = _View.of(returns, plane, centre, tolerance_m, limits)
@@ -412,8 +389,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     is_touched, behind_m, echo = _look_beyond(view, strips, placement)
     is_good &= ~is_touched
     # Upright edges tell the plate's place along its width, the others along its height: both are needed.
-    width_axis = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
-    is_upright = np.abs(strips.outwards[is_good] @ width_axis) > np.sqrt(0.5)
+    is_upright = np.abs(strips.outwards[is_good] @ placement.axes[0]) > np.sqrt(0.5)
     n_upright, n_level = int(np.count_nonzero(is_upright)), int(np.count_nonzero(~is_upright))
     if min(n_upright, n_level) < _MIN_STRIPS:
         return LIDAR_NO_BORDER.refusal(distance_m=distance_m, n_upright=n_upright, n_level=n_level)
