@@ -149,7 +149,7 @@ def test_a_result_of_lidars_is_read_back_and_exported(tmp_path):
     files = export([back], rig, tmp_path / "out", is_forced=True)
     assert {file.name for file in files} == {"extrinsics.yaml", "pair.urdf", "static_transforms.txt"}
     (tree,) = ExportJob([back], rig, tmp_path).trees
-    (joint,) = tree.joints
+    (joint,) = tree.above.values()
     assert (joint.parent, joint.child) == ("left_link", "right_link")
     assert np.allclose(joint.T_parent_child, result.T_cam_lidar)
 
