@@ -7,6 +7,7 @@ import importlib
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -210,7 +211,8 @@ def _calibrate(
     ]
 
     def fill(folder: Path) -> None:
-        result.write(folder)
+        result.write()
+        shutil.copytree(session.path / CALIBRATION, folder, dirs_exist_ok=True)
         replace_file(folder / PROFILE, dump_rig(session.rig).encode())
 
     return publish(registry, [row, *lacking], start_s, fill, saved=saved)

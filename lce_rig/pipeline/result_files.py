@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
-from lce_rig.export import export, is_export, remove_exports
+from lce_rig.export import export, is_export
 from lce_rig.session import Session
 from lce_rig.session.capture import MANIFEST, SAFE_NAME
 from lce_rig.session.durable import check_folder, copy_over, replacing, write_atomically
@@ -91,23 +91,15 @@ class Result:
         """List the content of result.json as plain types; raises like `file` and `ResultFile.document`."""
         return self.file().document()
 
-    def write(
-        self,
-        folder: Path | str | None = None,
-        *,
-        name: str | None = None,
-        force: bool = False,
-        report: bool = True,
-    ) -> WrittenResult:
-        """Write result.json and, unless a verdict is fail, exports in place of earlier ones; then a report.
+    def write(self, *, name: str | None = None, force: bool = False, report: bool = True) -> WrittenResult:
+        """Write result.json and, unless a verdict is fail, exports into the session; then a report.
 
-        In the session result.json and exports appear together, before the report is drawn. Files of the
+        result.json and exports appear together in calibration/, before the report is drawn. Files of the
         earlier run move to calibration/previous/, except that neither a failed run nor one without a camera's
         only usable result replaces a usable run there. If the result is identical byte for byte, report,
         overlays and calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
         Args:
-            folder: None for the session's calibration/; in any other folder files are replaced one by one.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
             report: write report.html, too, as `write_report` does; that of another result does not stay.
@@ -118,22 +110,26 @@ class Result:
                 unchanged.
             ResultRefusedError: a pose or covariance is not finite; the same.
         """
-        place, is_in_session = self._place(folder, name)
-        if is_in_session:
-            with replacing(self.session.path, place, _keep_earlier) as draft:
-                names, findings = self._write_into(draft, force=force)
-        else:
-            names, findings = self._write_into(place, force=force)
-        page = self.write_report(folder, name=name) if report else None
-        has_previous = is_in_session and (place / PREVIOUS / RESULT).exists()
-        files = tuple(place / file for file in names)
-        return WrittenResult(files, findings, page, place / PREVIOUS if has_previous else None)
+        place = result_folder(self.session.path, name, is_new=True)
+        usable = [c for c in self.pairs if force or c.verdict != "fail"]
+        findings: list[Finding] = []
+        files = [place / RESULT]
+        with replacing(self.session.path, place, _keep_earlier) as draft:
+            write_atomically(draft / RESULT, self.file().text())
+            if usable:
+                exported = export(
+                    usable, self.session.rig, draft, is_forced=force, session=self.session, findings=findings
+                )
+                files += [place / path.relative_to(draft) for path in exported]
+        page = self.write_report(name=name) if report else None
+        has_previous = (place / PREVIOUS / RESULT).exists()
+        return WrittenResult(tuple(files), tuple(findings), page, place / PREVIOUS if has_previous else None)
 
-    def write_report(self, folder: Path | str | None = None, *, name: str | None = None) -> Path:
+    def write_report(self, *, name: str | None = None) -> Path:
         """Draw report.html beside the result.json that `write` has written.
 
         Args:
-            folder, name: as of `write`.
+            name: as of `write`.
 
         Raises:
             SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
@@ -143,12 +139,8 @@ class Result:
 
         file = self.file()
         text = file.text()
-        place, is_in_session = self._place(folder, name)
-        has_previous = is_in_session and bool(_usable(place / PREVIOUS))
-        page = report_page(self.session, file, OVERLAYS, has_previous=has_previous)
-        if not is_in_session:
-            write_atomically(place / REPORT, page)
-            return place / REPORT
+        place = result_folder(self.session.path, name, is_new=True)
+        page = report_page(self.session, file, OVERLAYS, has_previous=bool(_usable(place / PREVIOUS)))
 
         def finish(earlier: Path, draft: Path) -> None:
             if result_content(earlier) != text.encode():
@@ -160,31 +152,6 @@ class Result:
         with replacing(self.session.path, place, finish) as draft:
             write_atomically(draft / REPORT, page)
         return place / REPORT
-
-    def _place(self, folder: Path | str | None, name: str | None) -> tuple[Path, bool]:
-        """Give the folder to write, and whether it is the session's own, which is replaced in one step."""
-        root = self.session.path
-        if folder is not None and Path(folder).resolve() != (root / CALIBRATION).resolve():
-            return Path(folder), False
-        return result_folder(root, name, is_new=True), True
-
-    def _write_into(self, folder: Path, *, force: bool) -> tuple[list[str], tuple[Finding, ...]]:
-        """Write result.json and the exports of usable results.
-
-        Returns:
-            The files' names, and the exports' findings.
-        """
-        write_atomically(folder / RESULT, self.file().text())
-        # Also in a folder whose files are replaced one by one, no report stays beside another result.
-        (folder / REPORT).unlink(missing_ok=True)
-        usable = [c for c in self.pairs if force or c.verdict != "fail"]
-        if not usable:
-            remove_exports(folder)
-            return [RESULT], ()
-        rig = self.session.rig
-        findings: list[Finding] = []
-        files = export(usable, rig, folder, is_forced=force, session=self.session, findings=findings)
-        return [RESULT, *(str(path.relative_to(folder)) for path in files)], tuple(findings)
 
 
 def result_folder(session: Path, name: str | None = None, *, is_new: bool = False) -> Path:

@@ -154,20 +154,6 @@ def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folde
     assert (folder / "previous" / "result.json" / "note").read_text() == "mine"
 
 
-def test_a_result_in_a_folder_elsewhere_leaves_the_session_as_it_is(session, tmp_path):
-    result = Result(session, (GOOD,))
-    for pair, has_exports in ((GOOD, True), (FAILED, False)):
-        written = Result(session, (pair,)).write(tmp_path / "elsewhere")
-        assert (len(written.files) > 1) == has_exports
-        assert names(tmp_path / "elsewhere") == {*(path.name for path in written.files), "report.html"}
-    assert not (session.path / "calibration").exists()
-    Result(session, (OTHER,)).write(tmp_path / "elsewhere", report=False)
-    assert not (tmp_path / "elsewhere" / "report.html").exists()
-    in_session = result.write(str(session.path / "calibration"))
-    assert result_content(session.path / "calibration") == result.file().text().encode()
-    assert in_session.files[0].parent == session.path / "calibration"
-
-
 def test_the_extrinsic_of_a_camera_is_given_by_its_name(session):
     result = Result(session, (GOOD,))
     assert result.of(GOOD.camera) is result.of(GOOD.camera, GOOD.lidar) is GOOD
