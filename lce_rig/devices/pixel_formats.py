@@ -18,16 +18,14 @@ class PixelFormat(NamedTuple):
     """How an image lies in memory.
 
     Attributes:
-        n_channels: values per pixel in a row; 1 for the planes of 4:2:0, 0 for JPEG files.
+        n_channels: values per pixel in a row; 0 for JPEG files.
         bits: of a value; above 8 it lies in two bytes, little end first.
         conversion: name of OpenCV's conversion to BGR; "" where none is needed.
-        n_chroma_planes: planes of quarter size behind the first: 2 apart, 1 with both in turn; 0 without.
     """
 
     n_channels: int
     bits: int = 8
     conversion: str = ""
-    n_chroma_planes: int = 0
 
     @property
     def is_compressed(self) -> bool:
@@ -46,8 +44,6 @@ FORMATS = {
     "Y16 ": PixelFormat(1, 16),
     "UYVY": PixelFormat(2, 8, "COLOR_YUV2BGR_UYVY"),
     "YUYV": PixelFormat(2, 8, "COLOR_YUV2BGR_YUY2"),
-    "NV12": PixelFormat(1, 8, "COLOR_YUV2BGR_NV12", 1),
-    "YU12": PixelFormat(1, 8, "COLOR_YUV2BGR_I420", 2),
     "BGR3": PixelFormat(3),
     "RGB3": PixelFormat(3, 8, "COLOR_RGB2BGR"),
     "BGR4": PixelFormat(4, 8, "COLOR_BGRA2BGR"),
@@ -97,13 +93,7 @@ class PixelDecoder:
         row = self._form.row_bytes(width)
         self._stride = max(stride, row)
         self._is_high_aligned = False
-        if self._form.is_compressed:
-            self.n_bytes = 1
-        elif self._form.n_chroma_planes:
-            # Both chroma values in turn fill rows as long as luma's; apart, two planes of rows half as long.
-            self.n_bytes = self._stride * height + self._stride * (height // 2)
-        else:
-            self.n_bytes = self._stride * (height - 1) + row
+        self.n_bytes = 1 if self._form.is_compressed else self._stride * (height - 1) + row
 
     def decode(self, data: bytes | bytearray | memoryview) -> Pixels:
         """Decode one image.
@@ -122,22 +112,10 @@ class PixelDecoder:
             if pixels.shape[:2] != (height, width):
                 raise ValueError(f"it is {pixels.shape[1]}x{pixels.shape[0]} px, not {width}x{height} px")
             return pixels
-        values: NDArray[Any]
-        if self._form.n_chroma_planes:
-            # The planes (3/2 H, W) of 4:2:0 close together, as OpenCV wants them.
-            flat, n_luma, n_planes = (
-                np.frombuffer(data, np.uint8),
-                self._stride * height,
-                self._form.n_chroma_planes,
-            )
-            luma = flat[:n_luma].reshape(height, self._stride)[:, :width]
-            chroma = flat[n_luma : self.n_bytes].reshape(n_planes * (height // 2), self._stride // n_planes)
-            values = np.concatenate((luma, chroma[:, : width // n_planes].reshape(height // 2, width)))
-        else:
-            kind, n_channels = np.dtype("<u2" if self._form.bits > 8 else "u1"), self._form.n_channels
-            strides = self._stride, n_channels * kind.itemsize, kind.itemsize
-            values = np.ndarray((height, width, n_channels), kind, data, 0, strides)
-            values = values[:, :, 0] if n_channels == 1 else values
+        kind, n_channels = np.dtype("<u2" if self._form.bits > 8 else "u1"), self._form.n_channels
+        strides = self._stride, n_channels * kind.itemsize, kind.itemsize
+        values: NDArray[Any] = np.ndarray((height, width, n_channels), kind, data, 0, strides)
+        values = values[:, :, 0] if n_channels == 1 else values
         if self._form.bits > 8:
             # Most drivers right-align, Xavier's VI left-aligns; seen once, it stays so in dark images.
             is_high = self._form.bits < 16 and bool(values.max() >> self._form.bits)

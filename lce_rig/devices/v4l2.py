@@ -281,7 +281,8 @@ class V4l2Source(LiveSource):
             what = f"does not offer pixel format {wanted}" if wanted else "offers no pixel format read here"
             listing = ", ".join(c.strip() for c in offered) or "none"
             raise SourceError(
-                f"{where} {what}", f"It offers {listing}: set driver.pixel_format to one of them."
+                f"{where} {what}",
+                f"It offers {listing}; read are {', '.join(FORMATS)}. Others: driver.type command.",
             )
         granted, stride = device.set_layout(code, width, height)
         if granted != (code, width, height):

@@ -177,13 +177,12 @@ def read(kernel, form, is_planar=False):
     )
 
 
-@pytest.mark.parametrize("form", ["NV12", "UYVY"])
-def test_images_come_whole_counted_and_stamped(kernel, form):
-    ran = read(kernel, form)
+def test_images_come_whole_counted_and_stamped(kernel):
+    ran = read(kernel, "UYVY")
     assert ran.returncode == 0, ran.stderr
     said = json.loads(ran.stdout)
     assert (
-        form in said["device"]
+        "UYVY" in said["device"]
         and said["clock"] == "clock.mid_exposure"
         and said["problems"] == ["clock.exposure_unknown"]
     )

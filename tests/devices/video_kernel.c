@@ -13,22 +13,19 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { N_BUFFERS = 8, BEGIN = 1 << 20, STEP = 1 << 22, WIDTH = 64, HEIGHT = 48, STRIDE = 96, TAIL = 40 };
+enum { N_BUFFERS = 8, BEGIN = 1 << 20, STEP = 1 << 22, WIDTH = 64, HEIGHT = 48, STRIDE = 192, TAIL = 40 };
 static unsigned char *memory[N_BUFFERS];
 static int queued[N_BUFFERS], n_queued, is_streaming;
 static unsigned sequence;
 
 static unsigned code(void) { unsigned c; memcpy(&c, getenv("VIDEO_FORMAT"), 4); return c; }
-static int is_two_bytes(void) { return code() == V4L2_PIX_FMT_UYVY; }
-static unsigned stride(void) { return is_two_bytes() ? 2 * STRIDE : STRIDE; }
-static unsigned used(void) { return is_two_bytes() ? stride() * HEIGHT : STRIDE * HEIGHT * 3 / 2; }
+static unsigned used(void) { return STRIDE * HEIGHT; }
 
 static void paint(unsigned char *at) {
     memset(at, 255, used() + TAIL); /* what must not be seen */
     for (unsigned k = 0; k < used(); k++) {
-        unsigned column = k % stride(), luma = 20 + column / (is_two_bytes() ? 4 : 2) + sequence;
-        int is_chroma = is_two_bytes() ? column % 2 == 0 : k >= STRIDE * HEIGHT;
-        at[k] = is_chroma ? 128 : luma;
+        unsigned column = k % STRIDE, luma = 20 + column / 4 + sequence;
+        at[k] = column % 2 ? luma : 128;
     }
 }
 
@@ -50,7 +47,7 @@ static int answer(unsigned long request, void *arg) {
         struct v4l2_format *f = arg;
         if (f->type != type) return EINVAL;
         struct v4l2_pix_format *p = &f->fmt.pix;
-        p->width = WIDTH, p->height = HEIGHT, p->pixelformat = code(), p->bytesperline = stride();
+        p->width = WIDTH, p->height = HEIGHT, p->pixelformat = code(), p->bytesperline = STRIDE;
         return 0; }
     case VIDIOC_REQBUFS: {
         struct v4l2_requestbuffers *r = arg;
