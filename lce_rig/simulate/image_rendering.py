@@ -43,13 +43,9 @@ def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
     is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
     is_carrier = (label >= 0) & (label < scene.board_index)
     lights = (_spread(light, is_carrier), _spread(light, label >= scene.board_index))
-    # Far from the carrier, rays can only hit the board; this saves half of them.
-    near_carrier = _dilate(_dilate(is_carrier))
-    for with_carrier in (False, True):
-        v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
-        if len(v):
-            rays = sub_rays(corners, v, u, SUBPIXELS)
-            painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays, with_carrier)
+    v, u = np.nonzero(is_edge)
+    rays = sub_rays(corners, v, u, SUBPIXELS)
+    painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays)
     radiance[rows, cols] = painted
     return radiance
 
@@ -130,12 +126,11 @@ def _look_through(
     lights: tuple[Array, Array],
     pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
     rays: Array,
-    with_carrier: bool,
 ) -> Array:
     """Average what n rays (M, n, 3) a pixel see: (M, 3), with the light on carrier and board there."""
     v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
     flat = rays.reshape(-1, 3)
-    hits = scene.cast_moving(origin, flat, with_carrier=with_carrier)
+    hits = scene.cast_moving(origin, flat)
     near = np.flatnonzero(hits.range_m < window.backdrop_range_m[v, u])
     kept = hits.select(near)
     on_carrier, on_board = (light[v[near], u[near]] for light in lights)

@@ -182,12 +182,10 @@ class Scene:
         hits = self.static.cast(origins, directions, with_normals=with_normals)
         return self._nearer(hits, self.cast_moving(origins, directions, with_normals=with_normals))
 
-    def cast_moving(
-        self, origins: Array, directions: Array, *, with_carrier: bool = True, with_normals: bool = True
-    ) -> Hits:
+    def cast_moving(self, origins: Array, directions: Array, *, with_normals: bool = True) -> Hits:
         """Find what each ray meets first of the carrier and the board, ignoring what stands before them."""
         hits = self.cast_board(origins, directions)
-        if not with_carrier or not self.moving.surfaces:
+        if not self.moving.surfaces:
             return hits
         carrier = self.moving.cast(origins, directions, with_normals=with_normals)
         shift = np.where(carrier.surface >= 0, len(self.static.surfaces), 0).astype(np.int32)
