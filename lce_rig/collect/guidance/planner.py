@@ -96,8 +96,6 @@ ENOUGH_SHARE = 0.9
 LEAST_SHARE = 0.1
 #: Where even the best placement brings less than this share, any new one is welcome.
 LEAST_GAIN = 0.02
-# Spacings of placements in these units: nearer ones are asked for when no others are left.
-_SPACINGS = (1.0, 0.5)
 #: Around a place that cannot be reached.
 AVOIDED_M = 0.4
 # A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
@@ -118,7 +116,6 @@ class Guidance(NamedTuple):
             state, which makes up for few captures; they have to be at most `ENOUGH_SHARE` of the target.
         n_more: about how many more captures it takes; 0 where there are enough, None where not known.
         T_cam_board: (4, 4) wanted; None where no reachable placement is new.
-        spacing: the share of the smallest move and turn by which a board must differ from every capture.
     """
 
     n_captures: int
@@ -130,7 +127,6 @@ class Guidance(NamedTuple):
     stated_translation_m: float
     n_more: int | None
     T_cam_board: Array | None
-    spacing: float
 
 
 class Planner:
@@ -181,7 +177,7 @@ class Planner:
         if avoid is not None:
             way_m = np.linalg.norm(avoid[:, None, :3, 3] - self.candidates[:, :3, 3], axis=-1)
             cost[way_m.min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
-        best, spacing = self._choose(cost, held, present)
+        best = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
         stated_rotation, stated_translation = sigmas(now.claimed(len(held)))
@@ -199,7 +195,6 @@ class Planner:
                 now, now.scatter if best is None else after.scatter[best], len(held), n_least
             ),
             T_cam_board=wanted,
-            spacing=spacing,
         )
 
     def adds_nothing(
@@ -229,7 +224,7 @@ class Planner:
         wanted = guidance.T_cam_board
         action = "nowhere" if wanted is None else ""
         instruction = "" if wanted is None else say(instruct(self.view, present, wanted))
-        alike = np.flatnonzero(self._is_like(held, present[None], guidance.spacing)[:, 0])
+        alike = np.flatnonzero(self._is_like(held, present[None])[:, 0])
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
             return CALIBRATE_KNOWN_PLACEMENT.refusal(action=action, capture=name, instruction=instruction)
@@ -270,27 +265,22 @@ class Planner:
                 return n_more
         return None
 
-    def _choose(self, cost: Array, held: Array, present: Array | None) -> tuple[int | None, float]:
-        """Choose the candidate of the least finite cost that is new, the farther from all held the better.
+    def _choose(self, cost: Array, held: Array, present: Array | None) -> int | None:
+        """Choose the candidate of the least finite cost that is new; None where there is none."""
+        is_taken = self._is_like(held, self.candidates).any(axis=0)
+        new = np.flatnonzero(~is_taken & np.isfinite(cost))
+        if not len(new):
+            return None
+        ranked = new[np.argsort(cost[new], kind="stable")]
+        if present is None or not self._is_like(held, present[None]).any():
+            return int(ranked[0])
+        # Move a board that stands at a capture on, not to where the instruction is "hold still".
+        away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
+        return int(next(away, ranked[0]))
 
-        Returns:
-            Its index, None where there is none; and the spacing at which it is new.
-        """
-        for spacing in _SPACINGS:
-            is_taken = self._is_like(held, self.candidates, spacing).any(axis=0)
-            new = np.flatnonzero(~is_taken & np.isfinite(cost))
-            if len(new):
-                ranked = new[np.argsort(cost[new], kind="stable")]
-                if present is None or not self._is_like(held, present[None], spacing).any():
-                    return int(ranked[0]), spacing
-                # Move a board that stands at a capture on, not to where the instruction is "hold still".
-                away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
-                return int(next(away, ranked[0])), spacing
-        return None, _SPACINGS[-1]
-
-    def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
+    def _is_like(self, held: Array, others: Array) -> NDArray[np.bool_]:
         """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
-        return find_alike(held, others, spacing * self._min_move_m, spacing * self._min_turn_rad)
+        return find_alike(held, others, self._min_move_m, self._min_turn_rad)
 
 
 _FEWEST, _MOST = 2, 6
