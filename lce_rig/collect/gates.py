@@ -355,14 +355,14 @@ class MotionGate:
                 0 <= now_ns - self._pending[0].detection.frame.time_ns < self._patience_ns
             ):
                 moments += self._decide_oldest()
-            if isinstance(self.judged, CaptureMoment) and self._taken.find_like(detection.poses) is None:
+            if isinstance(self.judged, CaptureMoment) and not self._taken.has_like(detection.poses):
                 self._pending.append(self.judged)
         return moments
 
     def _decide_oldest(self) -> list[CaptureMoment]:
         """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
         oldest = self._pending.popleft()
-        if self._taken.find_like(oldest.detection.poses) is not None:
+        if self._taken.has_like(oldest.detection.poses):
             return []
 
         def badness(moment: CaptureMoment) -> tuple[bool, float]:

@@ -254,7 +254,7 @@ class _Collector:
         if key in self._names_by_key:
             self.report.n_known += 1
             return
-        if known.find_like(poses) is not None:
+        if known.has_like(poses):
             self.report.counts.add(CALIBRATE_SAME_PLACEMENT.refusal())
             return
         events = [cut.events for cut in frame.events]

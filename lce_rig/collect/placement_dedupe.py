@@ -37,27 +37,19 @@ class Placements:
     def __init__(self, min_move_m: float = MIN_MOVE_M, min_turn_deg: float = MIN_TURN_DEG) -> None:
         self._min_move_m = min_move_m
         self._min_turn_rad = float(np.radians(min_turn_deg))
-        self._poses: list[tuple[str, ImageKey, Array]] = []
+        self._poses: dict[str, Mapping[ImageKey, Array]] = {}
 
     def add(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
         """Remember poses T_cam_board (4, 4) of a capture."""
-        self._poses.extend((name, key, T_cam_board) for key, T_cam_board in poses.items())
+        self._poses[name] = poses
 
     def remove(self, name: str) -> None:
         """Forget a capture: where it was made is new again."""
-        self._poses = [pose for pose in self._poses if pose[0] != name]
+        self._poses.pop(name, None)
 
-    def find_like(self, poses: Mapping[ImageKey, Array]) -> str | None:
-        """Name a capture in which every camera saw the board where it is now; None where it is new."""
-        likes: dict[str, list[bool]] = {}
-        for key, present in poses.items():
-            held = [(name, T) for name, of_camera, T in self._poses if of_camera == key]
-            if held:
-                stored = np.array([T for _, T in held])
-                alike = find_alike(stored, present[None], self._min_move_m, self._min_turn_rad)
-                for (name, _), is_like in zip(held, alike[:, 0], strict=True):
-                    likes.setdefault(name, []).append(bool(is_like))
-        return next((name for name in sorted(likes) if all(likes[name])), None)
+    def has_like(self, poses: Mapping[ImageKey, Array]) -> bool:
+        """Check whether every camera saw the board of one of the captures where it is now."""
+        return any(self.are_alike(held, poses) for held in self._poses.values())
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
         """Check whether every camera that saw both boards saw them at one place; False where none did."""
