@@ -16,20 +16,20 @@ from lce_rig.simulate.backdrop import (
     sub_rays,
 )
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.scene import Raycaster, Scene
 
 #: Samples a pixel along each axis wherever an edge runs through it.
 SUBPIXELS = 5
 _GAMMA = 1 / 2.2
-Light = NDArray[np.float32]
 
 
-def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
+def render_radiance(scene: Scene, backdrop: Backdrop, *, is_draft: bool = False) -> Array:
     """Compute what reaches the lens: linear (H, W, 3), anti-aliased where an edge of board or carrier runs.
 
     Args:
         scene: the room of the backdrop, with the board and its carrier.
         backdrop: the camera and its image of the static room.
+        is_draft: one ray a pixel and no shadows of board and carrier, at a tenth of the time.
     """
     radiance: Array = backdrop.radiance.copy()
     rows, cols = _region(scene, backdrop)
@@ -37,8 +37,13 @@ def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
         return radiance
     corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
     window = _ImageWindow(corners, backdrop.radiance[rows, cols], backdrop.range_m[rows, cols])
-    label, colour, light = _look_through_centres(scene, backdrop, window)
+    label, colour, light = _look_through_centres(
+        scene, backdrop, window, None if is_draft else scene.occluders
+    )
     painted = np.where((label >= 0)[..., None], colour * light, window.backdrop)
+    if is_draft:
+        radiance[rows, cols] = painted
+        return radiance
 
     is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
     is_carrier = (label >= 0) & (label < scene.board_index)
@@ -48,29 +53,6 @@ def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
     painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays)
     radiance[rows, cols] = painted
     return radiance
-
-
-def glance(scene: Scene, backdrop: Backdrop, noise: CameraNoise) -> tuple[tuple[slice, slice], Light]:
-    """Compute the light on the sensor where board and carrier are, at a tenth of `render_radiance`'s time.
-
-    One ray a pixel, no shadows: for boards on their way, of which nothing is captured.
-
-    Returns:
-        Rows and columns of the part of the image; and the linear light (h, w, 3) there.
-    """
-    rows, cols = _region(scene, backdrop)
-    if rows.stop <= rows.start or cols.stop <= cols.start:
-        return (rows, cols), np.zeros((rows.stop - rows.start, cols.stop - cols.start, 3), dtype=np.float32)
-    corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
-    rays = pixel_rays(corners).reshape(-1, 3)
-    hits = scene.cast_moving(backdrop.origin, rays)
-    seen = np.flatnonzero(hits.range_m < backdrop.range_m[rows, cols].ravel())
-    kept = hits.select(seen)
-    points = reached(backdrop.origin, rays[seen], kept)
-    painted = backdrop.radiance[rows, cols].reshape(-1, 3)
-    painted[seen] = scene.colour(kept, points) * irradiance(backdrop.lamps, points, kept.normals)
-    radiance = painted.reshape(rows.stop - rows.start, cols.stop - cols.start, 3)
-    return (rows, cols), _focus(radiance, sensor_gain(*backdrop.range_m.shape, noise)[rows, cols], noise)
 
 
 def _region(scene: Scene, backdrop: Backdrop) -> tuple[slice, slice]:
@@ -101,7 +83,7 @@ class _ImageWindow(NamedTuple):
 
 
 def _look_through_centres(
-    scene: Scene, backdrop: Backdrop, window: _ImageWindow
+    scene: Scene, backdrop: Backdrop, window: _ImageWindow, occluders: Raycaster | None
 ) -> tuple[NDArray[np.int32], Array, Array]:
     """Cast one ray a pixel: label (h, w) of what is seen, -1 the backdrop; its colour and light (h, w, 3)."""
     shape = window.backdrop.shape
@@ -113,7 +95,7 @@ def _look_through_centres(
     points = reached(backdrop.origin, rays[seen], kept)
     colour, light = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
     colour[seen] = scene.colour(kept, points)
-    light[seen] = irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
+    light[seen] = irradiance(backdrop.lamps, points, kept.normals, occluders)
     # Dark squares count as a surface of their own, so that edges of the pattern are found as edges.
     label[seen] += (kept.surface == scene.board_index) & scene.is_dark(points)
     return label.reshape(shape[:2]), colour.reshape(shape), light.reshape(shape)
@@ -179,35 +161,15 @@ def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
 
 def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Turn linear radiance (H, W, 3) into an image: vignetting, point spread, shot and read noise, gamma."""
-    linear = focus(radiance, noise)
-    if np.isfinite(noise.full_well_e):
-        normals = rng.standard_normal(linear.shape, dtype=np.float32)
-        return develop(linear + shot_noise_e(linear, noise) * normals / noise.full_well_e)
-    return develop(linear)
-
-
-def focus(radiance: Array, noise: CameraNoise) -> NDArray[np.float32]:
-    """Bring radiance (H, W, 3) onto the sensor, where its white is 1: vignetting and point spread."""
-    return _focus(radiance, sensor_gain(*radiance.shape[:2], noise), noise)
-
-
-def _focus(radiance: Array, gain: Array, noise: CameraNoise) -> Light:
     import cv2
 
-    linear = (radiance * gain[..., None]).astype(np.float32)
+    linear = (radiance * sensor_gain(*radiance.shape[:2], noise)[..., None]).astype(np.float32)
     if noise.blur_px > 0:
         soft = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
         linear = np.asarray(soft, dtype=np.float32)
-    return linear
-
-
-def shot_noise_e(linear: NDArray[np.float32], noise: CameraNoise) -> NDArray[np.float32]:
-    """Compute the standard deviation of shot and read noise, electrons, where light (H, W, 3) falls."""
-    electrons = np.clip(linear, 0, None) * noise.full_well_e
-    return np.asarray(np.sqrt(electrons + noise.read_noise_e**2))
-
-
-def develop(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Turn what a sensor measured (H, W, 3) into an image."""
+    if np.isfinite(noise.full_well_e):
+        electrons = np.clip(linear, 0, None) * noise.full_well_e
+        sigma_e = np.sqrt(electrons + noise.read_noise_e**2)
+        linear = linear + sigma_e * rng.standard_normal(linear.shape, dtype=np.float32) / noise.full_well_e
     tone = 255.0 * np.clip(linear, 0.0, 1.0) ** _GAMMA
     return np.asarray(np.rint(tone), dtype=np.uint8)

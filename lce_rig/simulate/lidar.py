@@ -142,8 +142,6 @@ _AZIMUTH_STEP_RAD = np.radians(0.01)
 # A board at 0.3 m/s is seen within 0.14 mm of where it is. The time is that of 16 sequences of a VLP-16; in
 # fewer firings than 256 nothing is gained.
 _INSTANT_NS, _FIRINGS_PER_INSTANT = 884_736, 256
-# No beam is wider than this, half its width, at the nearest that a body may be.
-_MARGIN_RAD, _NEAREST_M = 0.04, 0.5
 
 
 # Of a rosette's two prisms, for all of its lines, and of the Mid-360's rotor and mirror, Hz; no multiples.
@@ -293,36 +291,6 @@ def sweep_scene(
             rims.append(_near_border(moved, origins, directions, parts[-1], noise))
         returns, is_rim = join_rows(parts), np.concatenate(rims)
     return Sweep(laser, offset_ns, azimuth_rad, returns, is_rim)
-
-
-def sweep_again(
-    empty: Sweep, scene: Scene, T_world_lidar: Array, model: LidarModel, noise: LidarNoise
-) -> Sweep:
-    """Send the beams of a scan of the standing room once more, with the board and its carrier in it.
-
-    Only those that may hit them are traced; all others keep their returns.
-
-    Args:
-        empty: the returns without the board and its carrier.
-        scene: the same room with them.
-        T_world_lidar, model, noise: as for the scan.
-    """
-    bodies = [surface.mesh.vertices for surface in scene.moving.surfaces]
-    bodies.append(transform(scene.T_world_board, scene.board.outline()))
-    points = transform(invert(T_world_lidar), np.concatenate(bodies))
-    if np.hypot(points[:, 0], points[:, 1]).min() < _NEAREST_M:
-        near = np.arange(len(empty.laser))
-    else:
-        x, y = points[:, :2].mean(axis=0)
-        middle_rad = np.arctan2(y, x)
-        spread = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - middle_rad)))
-        around = np.angle(np.exp(1j * (empty.azimuth_rad - middle_rad)))
-        near = np.flatnonzero((around > spread.min() - _MARGIN_RAD) & (around < spread.max() + _MARGIN_RAD))
-    origins, directions = _beams(model, T_world_lidar, empty.laser[near], empty.azimuth_rad[near])
-    part = receive(scene, origins, directions, noise)
-    is_rim = empty.is_rim.copy()
-    is_rim[near] = _near_border(scene, origins, directions, part, noise)
-    return empty._replace(returns=put_rows(empty.returns, near, part), is_rim=is_rim)
 
 
 def measure_sweep(
