@@ -76,12 +76,9 @@ NO_PULSES = warning_kind(
     "stream.no_pulses", "no pulses for {line}", "check sync.triggers.{line}.channel and that triggers are on"
 )
 PULSE_LINES_LOST = warning_kind(
-    "stream.pulse_lines_lost", "messages of {n} pulses lost ({by_line})", "use a USB port of its own"
-)
-LINES_DROPPED_BY_BOARD = warning_kind(
-    "stream.lines_dropped_by_board",
-    "the board dropped {n} messages: the computer read too slowly",
-    "close other programs",
+    "stream.pulse_lines_lost",
+    "messages of {n} pulses lost ({by_line})",
+    "use a USB port of its own, and close other programs",
 )
 BUFFER_SMALL = warning_kind(
     "buffer.small",

@@ -222,7 +222,7 @@ class BoardState:
         n_restarts: how often the board restarted.
         restarted_ns: when it last did, by the steady clock; None where it did not.
         heard_ns: when the last message came, or the port was opened, by the steady clock.
-        hello, status, error: the last of each; None before the first.
+        hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: of the last time request.
         host_tracker, utc_tracker: followers of the computer's time of day and of UTC on the board's clock.
@@ -240,7 +240,6 @@ class BoardState:
         self.n_restarts = self.heard_ns = 0
         self.restarted_ns: int | None = None
         self.hello: Hello | None = None
-        self.status: BoardStatus | None = None
         self.pps: tuple[PpsEdge, Arrival] | None = None
         self.error: BoardError | None = None
         self.round_trip_ns: int | None = None
@@ -279,7 +278,7 @@ class BoardState:
                     self._asked = None
                     self.host_tracker.restart()
                     self.utc_tracker.restart()
-                    self.pps = self.status = None
+                    self.pps = None
                 self._latest_ns = max(self._latest_ns, t_us * 1000)
         match message:
             case Hello():
@@ -299,8 +298,6 @@ class BoardState:
                 if 0 <= self.round_trip_ns <= _MAX_ROUND_TRIP_NS:
                     middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
                     self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)
-            case BoardStatus():
-                self.status = message
             case BoardError():
                 self.error = message
         return []
@@ -356,8 +353,6 @@ class BoardState:
         if self.n_lost_by_line:
             by_line = ", ".join(f"{line} {n}" for line, n in sorted(self.n_lost_by_line.items()))
             problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
-        if self.status is not None and self.status.n_lost:
-            problems.append(findings.LINES_DROPPED_BY_BOARD(n=self.status.n_lost))
         if self.host_clock is None and has_waited:
             problems.append(findings.BOARD_NOT_TIED())
         steps = self.host_tracker.steps
