@@ -15,6 +15,7 @@ from lce_rig.cli.options import explain_option, json_option, path_option, sessio
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
 from lce_rig.core.phrasing import as_line, significant, sizes
+from lce_rig.detect.detection import Pair
 from lce_rig.judge.repeatability import Repeatability
 from lce_rig.pipeline.comparison import compare_results
 from lce_rig.pipeline.comparison import repeat as compare
@@ -144,10 +145,6 @@ def _records(session: Session, stored: Sequence[StoredResult]) -> list[dict[str,
     return records
 
 
-# Short, so that the table fits into 80 columns.
-_SCENE = {"agrees": "agrees", "contradicts": "[red]differs[/]", "unknown": "?"}
-
-
 @click.command()
 @session_argument
 @json_option
@@ -174,9 +171,12 @@ def results(session: Path, as_json: bool) -> None:
         ]
         show.print_json({"format_version": 1, "rig": opened.rig.name, "results": document})
         return
-    show.print_parts(_tables(stored))
     if not stored:
         show.say(f"no results in {session}: run `lce-rig calibrate {session}`")
+        return
+    headings = ("result", "sensors", "method", ">used", ">deg", ">mm", "verdict", "written")
+    rows = (row for result in stored for row in _rows(result))
+    show.print_table(show.plain_table("", *headings, rows=rows))
     dates = {result.file.provenance.date_words: None for result in stored if result.file}
     if any(dates):
         show.note(f"date of the captures: {'; '.join(filter(None, dates))}")
@@ -204,34 +204,23 @@ def _pair(c: Calibration) -> dict[str, Any]:
     }
 
 
-def _tables(stored: list[StoredResult]) -> list[Any]:
-    """List results by camera and LiDAR, a table each, and those that cannot be read."""
-    headings = ("result", "method", "channels", ">used", ">deg", ">mm", ">px", "verdict", "scene", "written")
-    rows: dict[str, list[tuple[str, ...]]] = {}
-    for result in stored:
-        written = datetime.fromtimestamp(result.written_s).strftime("%Y-%m-%d %H:%M")
-        name = show.escape(result.name)
-        if result.file is None:
-            rows.setdefault("", []).append((name, "[red]unreadable[/]"))
-        for c in () if result.file is None else result.file.pairs:
-            each = _pair(c)
-            row = (
-                name,
-                c.method,
-                show.escape("+".join(c.channels)),
-                f"{each['n_captures_used']}",
-                f"{c.sigma_rotation_deg:.3f}",
-                f"{1000 * c.sigma_translation_m:.1f}",
-                "-" if each["reprojection_px"] is None else f"{each['reprojection_px']:.2f}",
-                f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
-                "-" if c.scene is None else _SCENE[c.scene.state],
-                written,
-            )
-            rows.setdefault(f"{c.camera} and {c.lidar}", []).append(row)
-    return [
-        show.plain_table(show.escape(sensors), *(headings if sensors else ("result", "")), rows=cells)
-        for sensors, cells in rows.items()
-    ]
+def _rows(result: StoredResult) -> Iterator[tuple[str, ...]]:
+    """List the sensors of a result, or that it cannot be read."""
+    name = show.escape(result.name)
+    if result.file is None:
+        yield name, "[red]unreadable[/]"
+        return
+    for c in result.file.pairs:
+        yield (
+            name,
+            show.escape(str(Pair.of(c))),
+            c.method,
+            f"{len(c.captures_used)}",
+            f"{c.sigma_rotation_deg:.3f}",
+            f"{1000 * c.sigma_translation_m:.1f}",
+            f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
+            datetime.fromtimestamp(result.written_s).strftime("%Y-%m-%d %H:%M"),
+        )
 
 
 @click.command()
