@@ -8,6 +8,7 @@ recording. Without any of them the sensors make a tree of their own. All outputs
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
 import numpy as np
@@ -116,16 +117,10 @@ class RobotTree:
         roots = [link for link in counts if link not in above]
         if has_one_root and len(roots) > 1:
             faults.append(f"several roots: {', '.join(roots)}")
-        rooted = set(roots)
-        for frame in () if faults else above:
-            way: dict[str, None] = {}
-            while frame not in rooted and frame not in way:
-                way[frame] = None
-                frame = above[frame].parent
-            if frame in way:
-                faults.append(f"a loop: {' < '.join([*way, frame])}")
-                break
-            rooted.update(way)
+        try:
+            TopologicalSorter({child: [joint.parent] for child, joint in above.items()}).prepare()
+        except CycleError as error:
+            faults.append(f"a loop: {' < '.join(error.args[1])}")
         if faults:
             raise SessionError(f"{source}: not a tree of frames: {faults[0]}")
         return cls(source, frozenset(counts), above)
