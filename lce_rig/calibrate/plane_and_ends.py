@@ -8,13 +8,12 @@ With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR's leave
 where n is the board's normal and g its middle as the camera sees them, m the outward normal of the edge
 nearest to the ring end and h a point on that edge. Ring ends lie by the edge shift d beyond the print.
 
-Both are distances along a normal. `residual_rows` writes them linear in vec R and t, for moments of many
-points; `differentiate` gives their derivatives by the tangent of (R, t). Algorithm 1, the likelihood, the
-validation, the estimate of time offsets and the guidance take them from here.
+Both are distances along a normal. `CaptureFeatures.board_rows` writes them linear in vec R and t, for moments
+of many points; `differentiate` gives their derivatives by the tangent of (R, t). Algorithm 1, the likelihood,
+the validation, the estimate of time offsets and the guidance take them from here.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,27 +40,59 @@ class CaptureFeatures:
 
     Attributes:
         capture: its name.
+        board: its size.
         plane_points: (N, 3) frame lidar, m.
         edge_points: (M, 3) ring ends, frame lidar, m.
         lidar_normal: (3,) of the board, towards the LiDAR, frame lidar.
-        normal: (3,) of the board, towards the camera, frame camera.
-        centre: (3,) of the plate, frame camera, m.
-        edge_normals: (4, 3) outwards in the board's plane, frame camera.
-        edge_anchors: (4, 3) a point on each edge, frame camera, m.
-        T_board_cam: (4, 4).
-        cov_normal: (3, 3) of `normal`.
+        T_cam_board: (4, 4).
+        cov: (6, 6) of it, tangent (translation m, rotation rad).
     """
 
     capture: str
+    board: Board
     plane_points: Array
     edge_points: Array
     lidar_normal: Array
-    normal: Array
-    centre: Array
-    edge_normals: Array
-    edge_anchors: Array
-    T_board_cam: Array
-    cov_normal: Array
+    T_cam_board: Array
+    cov: Array
+
+    @property
+    def normal(self) -> Array:
+        """(3,) of the board, towards the camera, frame camera."""
+        return self.T_cam_board[:3, 2]
+
+    @property
+    def centre(self) -> Array:
+        """(3,) of the plate, frame camera, m."""
+        return self.T_cam_board[:3, 3]
+
+    @property
+    def cov_normal(self) -> Array:
+        """(3, 3) of `normal`.
+
+        With R = exp(phi^) R0 it moves by phi x n = -n^ phi, hence cov_n = n^ cov_phi n^T (the paper's
+        equation for the left perturbation).
+        """
+        cross = skew(self.normal)
+        return np.asarray(cross @ self.cov[3:, 3:] @ cross.T)
+
+    @property
+    def edge_normals(self) -> Array:
+        """(4, 3) outwards in the board's plane, frame camera."""
+        return np.asarray(self.board.edges()[1] @ self.T_cam_board[:3, :3].T)
+
+    def board_rows(self, points: Array) -> Array:
+        """Write the board coordinates of points (N, 3) of the LiDAR as rows that multiply [vec R; t; d; 1].
+
+        Returns:
+            (N, 3, 14), no matter how far ring ends lie beyond the print.
+        """
+        T_board_cam = invert(self.T_cam_board)
+        R = T_board_cam[:3, :3]
+        rows = np.zeros((len(points), 3, 14))
+        rows[:, :, :9] = (points[:, None, :, None] * R[:, None]).reshape(-1, 3, 9)
+        rows[:, :, 9:12], rows[:, :, 13] = R, T_board_cam[:3, 3]
+        return rows
 
 
 def extract_features(observation: Observation, board: Board, *, half_step: bool = True) -> CaptureFeatures:
@@ -79,29 +110,13 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
         ends = turn_about_z(ends, lidar.edge_side * lidar.azimuth_step_rad / 2)
     return CaptureFeatures(
         capture=observation.capture,
+        board=board,
         plane_points=_meet_plane(np.asarray(lidar.points, dtype=np.float64), lidar.plane),
         edge_points=_meet_plane(ends, lidar.plane),
         lidar_normal=lidar.plane[:3],
-        **features_of_camera(observation.image.T_cam_board, observation.image.cov, board),
+        T_cam_board=observation.image.T_cam_board,
+        cov=observation.image.cov,
     )
-
-
-def features_of_camera(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:
-    """Compute the features of the camera's side from a pose and its covariance (6, 6).
-
-    With R = exp(phi^) R0 the normal moves by phi x n = -n^ phi, hence cov_n = n^ cov_phi n^T (the paper's
-    equation for the left perturbation).
-    """
-    normal, cross = T_cam_board[:3, 2], skew(T_cam_board[:3, 2])
-    anchors_board, normals_board = board.edges()
-    return {
-        "normal": normal,
-        "centre": T_cam_board[:3, 3],
-        "edge_normals": normals_board @ T_cam_board[:3, :3].T,
-        "edge_anchors": transform(T_cam_board, anchors_board),
-        "T_board_cam": invert(T_cam_board),
-        "cov_normal": cross @ cov[3:, 3:] @ cross.T,
-    }
 
 
 def _meet_plane(points: Array, plane: Array) -> Array:
@@ -124,30 +139,6 @@ def turn_about_z(vectors: Array, angle_rad: Array) -> Array:
     x = cosine * vectors[:, 0] - sine * vectors[:, 1]
     y = sine * vectors[:, 0] + cosine * vectors[:, 1]
     return np.stack([x, y, vectors[:, 2]], axis=1)
-
-
-def residual_rows(normals: Array, anchors: Array, points: Array, nuisances: Array | None = None) -> Array:
-    """Write the residuals n . (g - R p - t) + c . s as rows a of a . x, x = [vec R; t; s; 1].
-
-    Args:
-        normals: (..., 3) unit n, target frame.
-        anchors: (..., 3) g on the plane or line, m, target frame.
-        points: (..., 3) p, m, source frame.
-        nuisances: (..., k) coefficients c; none by default.
-
-    Returns:
-        (..., 13 + k).
-    """
-    normals, anchors, points = np.broadcast_arrays(normals, anchors, points)
-    batch = points.shape[:-1]
-    lever = -(points[..., :, None] * normals[..., None, :]).reshape(*batch, 9)
-    offset = np.sum(normals * anchors, axis=-1, keepdims=True)
-    extra = (
-        np.zeros((*batch, 0))
-        if nuisances is None
-        else np.broadcast_to(nuisances, (*batch, nuisances.shape[-1]))
-    )
-    return np.concatenate([lever, -normals, extra, offset], axis=-1)
 
 
 def along_normals(normals: Array, anchors: Array, points: Array, T: Array) -> Array:
@@ -180,20 +171,19 @@ def plane_residuals(f: CaptureFeatures, T_cam_lidar: Array, points: Array | None
     return along_normals(f.normal, f.centre, f.plane_points if points is None else points, T_cam_lidar)
 
 
-def end_residuals(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, NDArray[np.intp]]:
+def end_residuals(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, NDArray[np.intp]]:
     """Evaluate (2) without shift for a capture's ring ends and their nearest edges.
 
     Args:
         f: of the capture.
         T_cam_lidar: (..., 4, 4).
-        board: its size.
 
     Returns:
         Distances inside the edge (..., M), and the edges' numbers.
     """
     ends = ends_on_board(f, T_cam_lidar)
-    edge = board.nearest_edge(ends)
-    return distance_inside(board, ends, edge), edge
+    edge = f.board.nearest_edge(ends)
+    return distance_inside(f.board, ends, edge), edge
 
 
 def distance_inside(board: Board, xy_m: Array, edge: NDArray[np.intp]) -> Array:
@@ -204,16 +194,16 @@ def distance_inside(board: Board, xy_m: Array, edge: NDArray[np.intp]) -> Array:
 
 def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:
     """Take a capture's ring ends to the frame of the board that the camera sees: (..., M, 3)."""
-    return transform(f.T_board_cam @ T_cam_lidar, f.edge_points)
+    return transform(invert(f.T_cam_board) @ T_cam_lidar, f.edge_points)
 
 
-def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, Array, NDArray[np.intp]]:
+def end_rows(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, Array, NDArray[np.intp]]:
     """Linearise (2) for a capture's ring ends.
 
     Returns:
         Values (M,), derivatives (M, 8) by tangent (6), shift d and scale s, and the edges' numbers (M,).
     """
-    inside_m, edge = end_residuals(f, T_cam_lidar, board)
+    inside_m, edge = end_residuals(f, T_cam_lidar)
     normals = f.edge_normals[edge]
     by_tangent = differentiate(normals, f.edge_points @ T_cam_lidar[:3, :3].T)
     return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre]), edge

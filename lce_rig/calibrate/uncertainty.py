@@ -151,7 +151,7 @@ def moves_by_scans(start: Algorithm1, board: Board) -> ScanMoves:
         J = np.zeros((len(points), 7))
         J[:, :6] = differentiate(f.normal, points @ T[:3, :3].T)
         by_lift = -weights.plane / max(len(points), 1) * J.T @ _one_x_y(T_board_lidar, points)
-        _, J_end, edge = end_rows(f, T, board)
+        _, J_end, edge = end_rows(f, T)
         J_end = weights.edge / max(len(edge), 1) * J_end[:, :7]
         outwards = np.sum(f.edge_normals[edge] * (f.edge_points @ T[:3, :3].T), axis=1)
         sideways = (outwards / (f.edge_points @ normal))[:, None]

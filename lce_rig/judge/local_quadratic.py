@@ -65,14 +65,14 @@ def expand(
         rings: (L,) whose offsets are unknowns; None for those that occur.
     """
     features = [extract_features(seen, board) for seen in observations]
-    sigmas = sigmas or feature_sigmas(features, board, T_cam_lidar)
+    sigmas = sigmas or feature_sigmas(features, T_cam_lidar)
     if rings is None:
         rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
     p = FIRST_RING + len(rings) + len(OF_PROFILE)
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
     for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
         r_plane, J_plane = plane_rows(f, T_cam_lidar, seen.lidar, rings)
-        r_end, by_end, edge = end_rows(f, T_cam_lidar, board)
+        r_end, by_end, edge = end_rows(f, T_cam_lidar)
         J_end = np.zeros((len(r_end), p))
         J_end[:, [*range(FIRST_RING), SCALE]] = by_end
         # A pattern that sits farther right has the plate's edges farther left.
@@ -156,23 +156,23 @@ class FeatureSigmas(NamedTuple):
     end_m: float
 
 
-def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
+def feature_sigmas(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> FeatureSigmas:
     """Return the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
     planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
-    inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
+    inside_m = np.concatenate([end_residuals(f, T_cam_lidar)[0] for f in features])
     # Ring ends reach beyond the plate by the beam's width, which is no error.
     end_m = 1.4826 * float(np.median(np.abs(inside_m - np.median(inside_m))))
     return FeatureSigmas(max(float(np.median(planes_m)), _PLANE_FLOOR_M), max(end_m, _END_FLOOR_M))
 
 
-def capture_costs(f: CaptureFeatures, board: Board, T_cam_lidar: Array, sigmas: FeatureSigmas) -> Array:
+def capture_costs(f: CaptureFeatures, T_cam_lidar: Array, sigmas: FeatureSigmas) -> Array:
     """Sum the squares of a capture's residuals under extrinsics (B, 4, 4): (B,).
 
     The mean square over the plane's points counts `PLANE_FREEDOMS` / sigma^2, each ring end 1 / sigma^2 after
     their mean is subtracted: they reach beyond the plate by the beam's width, alike on all sides.
     """
     plane_m = plane_residuals(f, T_cam_lidar)
-    inside_m, _ = end_residuals(f, T_cam_lidar, board)
+    inside_m, _ = end_residuals(f, T_cam_lidar)
     own_m = inside_m - inside_m.mean(axis=1, keepdims=True) if inside_m.shape[1] else inside_m
     by_plane = PLANE_FREEDOMS * np.mean(plane_m**2, axis=1) / sigmas.plane_m**2
     return np.asarray(by_plane + np.sum(own_m**2, axis=1) / sigmas.end_m**2)

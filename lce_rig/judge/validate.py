@@ -206,7 +206,7 @@ class _Test:
         self._board, self._T, self._lidar = board, T_cam_lidar, lidar
         self._names = [observation.capture for observation in used]
         features = [extract_features(observation, board) for observation in used]
-        self._sigmas = feature_sigmas(features, board, T_cam_lidar)
+        self._sigmas = feature_sigmas(features, T_cam_lidar)
         self._rings = np.unique(np.concatenate([o.lidar.ring for o in (*used, *rejected)]))
         self._used = self._expand(used, T_cam_lidar)
         x = self._used.optimum()
@@ -255,7 +255,7 @@ class _Test:
 
     def _costs(self, group: Sequence[Observation], T: Array) -> Array:
         features = [extract_features(observation, self._board) for observation in group]
-        return np.array([capture_costs(f, self._board, T[None], self._sigmas)[0] for f in features])
+        return np.array([capture_costs(f, T[None], self._sigmas)[0] for f in features])
 
     def _settled(self, group: Sequence[Observation], T: Array, x: Array) -> tuple[Array, Array]:
         """Expand a group about T with the constants in x: half gradients (F, 6), half Hessians (F, 6, 6)."""

@@ -35,7 +35,7 @@ def longer(item, rings, offset_m):
 def linearised(captures):
     """Solve captures for good, and differentiate the solution by each ring's offset."""
     features = [extract_features(seen, BOARD) for seen in captures]
-    problem = Problem(features, BOARD, Weights(3e4, 2e5))
+    problem = Problem(features, Weights(3e4, 2e5))
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
     cost = problem.quadratics(solution.x[0], solution.edge_ids[0])
     start = replace(solve(captures, BOARD), fitted=captures, problem=problem, solution=solution, cost=cost)

@@ -80,20 +80,20 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
     features = [extract_features(observation, board) for observation in observations]
-    problem, T_planes = solve_planes(features, board, (NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
+    problem, T_planes = solve_planes(features, (NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     fitted = list(observations)
-    shifts_m = estimate_shifts(observations, features, T_planes, board)
+    shifts_m = estimate_shifts(observations, features, T_planes)
     if shifts_m.any():
-        fitted = move_ends(observations, features, T_planes, board, shifts_m)
+        fitted = move_ends(observations, features, T_planes, shifts_m)
         features = [extract_features(observation, board) for observation in fitted]
-        problem = Problem(features, board, problem.weights)
+        problem = Problem(features, problem.weights)
 
     refused, plane_m, edge_m = reject_outliers(features, problem, T_planes)
     observations = [o for o in observations if o.capture not in refused]
     fitted = [o for o in fitted if o.capture not in refused]
     features = [f for f in features if f.capture not in refused]
     sigmas = max(float(np.median(plane_m)), _SIGMA_FLOOR_M), max(float(np.median(edge_m)), _SIGMA_FLOOR_M)
-    problem, T_planes = solve_planes(features, board, sigmas, drop_uncertain(features, T_planes))
+    problem, T_planes = solve_planes(features, sigmas, drop_uncertain(features, T_planes))
     solution = problem.solve(np.ones((1, problem.n_captures)), T_planes)
 
     plane, edge = problem.errors(solution.x)
@@ -122,7 +122,6 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
 
 def solve_planes(
     features: Sequence[CaptureFeatures],
-    board: Board,
     sigmas_m: tuple[float, float],
     keep: Sequence[NDArray[np.bool_]] | None = None,
 ) -> tuple[Problem, Array]:
@@ -138,7 +137,6 @@ def solve_planes(
 
     Args:
         features: of each capture.
-        board: the board.
         sigmas_m: typical errors of a capture's plane and of its ring ends.
         keep: per capture a mask of the plane points to use; all by default.
 
@@ -150,11 +148,11 @@ def solve_planes(
     """
     n_ends = float(np.mean([len(f.edge_points) for f in features]))
     weights = Weights(PLANE_FREEDOMS / sigmas_m[0] ** 2, n_ends / sigmas_m[1] ** 2)
-    problem = Problem(features, board, weights, keep)
+    problem = Problem(features, weights, keep)
     R_start = rotation_from_directions(
         np.array([f.normal for f in features]), np.array([f.lidar_normal for f in features])
     )
-    no_edges = np.zeros((1, len(problem.edge_capture)), dtype=np.int8)
+    no_edges = np.zeros((1, len(problem.edge_capture)), dtype=np.intp)
     Q, L = eliminate_linear(problem.moments(np.ones((1, len(features))), no_edges, Weights(1.0, 0.0)))
     R, _ = solve_globally(Q, R_start[None])
     T_cam_lidar = pose(R[0], linear_unknowns(L, R)[0, :3])

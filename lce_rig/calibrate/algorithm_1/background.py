@@ -19,7 +19,6 @@ from lce_rig.calibrate.plane_and_ends import (
     end_rows,
 )
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
-from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
@@ -40,7 +39,7 @@ _ONE_IN = 1000
 
 
 def estimate_shifts(
-    observations: Sequence[Observation], features: Sequence[CaptureFeatures], T_cam_lidar: Array, board: Board
+    observations: Sequence[Observation], features: Sequence[CaptureFeatures], T_cam_lidar: Array
 ) -> Array:
     """Estimate how far each column of `describe_background` shifts ring ends, outwards: (3,) m.
 
@@ -51,11 +50,10 @@ def estimate_shifts(
         observations: F captures.
         features: of each.
         T_cam_lidar: (4, 4) near the truth.
-        board: the board.
     """
     from scipy.special import fdtri
 
-    parts = [end_rows(f, T_cam_lidar, board) for f in features]
+    parts = [end_rows(f, T_cam_lidar) for f in features]
     first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _, _ in parts]))
     inside = np.concatenate([r for r, _, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
@@ -108,13 +106,12 @@ def move_ends(
     observations: Sequence[Observation],
     features: Sequence[CaptureFeatures],
     T_cam_lidar: Array,
-    board: Board,
     shifts_m: Array,
 ) -> list[Observation]:
     """Subtract the shifts (3,) of `estimate_shifts` from ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        _, edge = end_residuals(f, T_cam_lidar, board)
+        _, edge = end_residuals(f, T_cam_lidar)
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)

@@ -7,8 +7,8 @@ Per capture k the cost is
 over the board's plane (n_k, g_k) and edges (m_e, h_e) as the camera sees them, points p_i and ring ends q_j
 of the LiDAR, the edge e(j) nearest to each ring end, and the edge shift d by which ring ends appear beyond
 the print. Means and not sums, so that a board nearby does not outvote one farther away by its many points:
-all points of a capture share the errors of the board's pose in the image. Every ring end keeps one moment
-matrix for each of the four edges, so that association only chooses which are summed.
+all points of a capture share the errors of the board's pose in the image. Every ring end keeps one row for
+each of the four edges, so that association only chooses which are summed.
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,8 @@ from lce_rig.calibrate.algorithm_1.registration import (
     vec_rotation,
     with_one,
 )
-from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, CaptureFeatures, residual_rows
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, CaptureFeatures
 from lce_rig.calibrate.quadratics import Quadratics
-from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
 
 N_ROUNDS = 3
@@ -57,7 +56,7 @@ class Solutions:
 
     R: Array
     linear: Array
-    edge_ids: NDArray[np.int8]
+    edge_ids: NDArray[np.intp]
     certificates: Certificates
 
     @property
@@ -72,11 +71,10 @@ class Solutions:
 
 
 class Problem:
-    """Moment matrices of F captures, as rows of their upper triangles.
+    """Moment matrices of F captures' planes, and rows of their ring ends.
 
     Args:
         features: one per capture.
-        board: the board.
         weights: of the terms.
         keep: per capture a mask of the plane points to use; all by default.
     """
@@ -84,46 +82,26 @@ class Problem:
     def __init__(
         self,
         features: Sequence[CaptureFeatures],
-        board: Board,
         weights: Weights,
         keep: Sequence[NDArray[np.bool_]] | None = None,
     ) -> None:
-        self.n_captures = len(features)
-        self.keep = keep
-        self._upper = np.triu_indices(_SIZE)
-        self._board = board
-        masks = [np.ones(len(f.plane_points), dtype=bool) for f in features] if keep is None else keep
-        planes = []
-        for f, mask in zip(features, masks, strict=True):
-            rows = residual_rows(f.normal, f.centre, f.plane_points[mask], np.zeros((1, 1)))
-            planes.append((rows.T @ rows)[self._upper] / max(len(rows), 1))
-        self.plane = np.stack(planes)
+        self.n_captures, self.weights, self.keep = len(features), weights, keep
+        self._board = features[0].board
+        self.plane = np.zeros((len(features), _SIZE, _SIZE))
+        for k, f in enumerate(features):
+            heights = f.board_rows(f.plane_points if keep is None else f.plane_points[keep[k]])[:, 2]
+            self.plane[k] = heights.T @ heights / max(len(heights), 1)
         counts = [len(f.edge_points) for f in features]
         self.edge_capture = np.repeat(np.arange(len(features)), counts)
         self._edge_weight = 1.0 / np.maximum(np.array(counts), 1)[self.edge_capture]
-        # Ring ends are sorted by capture: the first of each, and the captures that have any.
-        self._first_end = np.flatnonzero(np.diff(self.edge_capture, prepend=-1))
-        shift = np.ones((1, 1, 1))
-        edge_rows = np.concatenate(
-            [
-                residual_rows(f.edge_normals[None], f.edge_anchors[None], f.edge_points[:, None], shift)
-                for f in features
-            ]
-        )
-        # Board coordinates x, y of ring ends (n, 2, 14): rows that multiply [vec R; t; d; 1].
-        self._to_board = np.zeros((len(self.edge_capture), 2, _SIZE))
-        for k, f in enumerate(features):
-            rows, R = self._to_board[self.edge_capture == k], f.T_board_cam[:2, :3]
-            rows[:, :, :9] = (f.edge_points[:, None, :, None] * R[None, :, None, :]).reshape(-1, 2, 9)
-            rows[:, :, 9:12], rows[:, :, -1] = R, f.T_board_cam[:2, 3]
-            self._to_board[self.edge_capture == k] = rows
-        # In place: with hundreds of captures, this is the largest array of a calibration.
-        self.edge = edge_rows[..., self._upper[0]]
-        self.edge *= edge_rows[..., self._upper[1]]
-        self.edge *= self._edge_weight[:, None, None]
-        self.weights = weights
+        # Board coordinates x, y of ring ends (n, 2, 14), and how far they lie inside each edge (n, 4, 14).
+        self._to_board = np.concatenate([f.board_rows(f.edge_points)[:, :2] for f in features])
+        anchors, normals = (of_edges[:, :2] for of_edges in self._board.edges())
+        self._inside = -normals @ self._to_board
+        self._inside[:, :, 12] += 1
+        self._inside[:, :, 13] += np.sum(anchors * normals, axis=1)
 
-    def associate(self, x: Array) -> NDArray[np.int8]:
+    def associate(self, x: Array) -> NDArray[np.intp]:
         """Find the nearest of the board's edges to each ring end.
 
         Args:
@@ -132,20 +110,22 @@ class Problem:
         Returns:
             (B, n), as `Board.nearest_edge`.
         """
-        return self._board.nearest_edge(self._on_board(x)).astype(np.int8)
+        return self._board.nearest_edge(self._on_board(x))
 
     def _on_board(self, x: Array) -> Array:
         """Compute board coordinates (B, n, 2) of the ring ends, each coordinate in a block of its own."""
         return np.moveaxis(np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T]), 0, -1)
 
-    def _by_capture(self, values: Array) -> Array:
-        """Sum values (n, ...) of ring ends by capture: (F, ...)."""
-        sums = np.zeros((self.n_captures, *values.shape[1:]))
-        if len(values):
-            sums[self.edge_capture[self._first_end]] = np.add.reduceat(values, self._first_end, axis=0)
-        return sums
+    def _mean_of_ends(self, values: Array) -> Array:
+        """Average values (n, ...) of ring ends, which are sorted by capture: (F, ...), 0 without any."""
+        means = np.zeros((self.n_captures, *values.shape[1:]))
+        first = np.flatnonzero(np.diff(self.edge_capture, prepend=-1))
+        if len(first):
+            weighted = (values.T * self._edge_weight).T
+            means[self.edge_capture[first]] = np.add.reduceat(weighted, first, axis=0)
+        return means
 
-    def moments(self, selection: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None) -> Array:
+    def moments(self, selection: Array, edge_ids: NDArray[np.intp], weights: Weights | None = None) -> Array:
         """Sum (1) over sets of captures.
 
         Args:
@@ -157,21 +137,12 @@ class Problem:
             (B, 14, 14).
         """
         w = weights or self.weights
-        ends = np.arange(edge_ids.shape[1])
-        total = np.array(
-            [
-                captures @ (w.plane * self.plane + w.edge * self._by_capture(self.edge[ends, ids]))
-                for captures, ids in zip(selection, edge_ids, strict=True)
-            ]
-        )
-        M = self._unpack(total)
+        M = w.plane * np.tensordot(selection, self.plane, axes=1)
+        for k, ids in enumerate(edge_ids):
+            rows = self._inside[np.arange(len(ids)), ids]
+            weight = w.edge * selection[k, self.edge_capture] * self._edge_weight
+            M[k] += rows.T @ (weight[:, None] * rows)
         M[:, 12, 12] += EDGE_SHIFT_SIGMA_M**-2
-        return M
-
-    def _unpack(self, upper: Array) -> Array:
-        M = np.empty((len(upper), _SIZE, _SIZE))
-        M[:, self._upper[0], self._upper[1]] = upper
-        M[:, self._upper[1], self._upper[0]] = upper
         return M
 
     def solve(self, selection: Array, T_start: Array, n_rounds: int = N_ROUNDS) -> Solutions:
@@ -195,7 +166,7 @@ class Problem:
     def quadratics(
         self,
         x: Array,
-        edge_ids: NDArray[np.int8],
+        edge_ids: NDArray[np.intp],
         placement: NDArray[np.intp] | None = None,
         weights: Weights | None = None,
     ) -> Quadratics:
@@ -208,9 +179,9 @@ class Problem:
             weights: other weights than the problem's.
         """
         w = weights or self.weights
-        ends = self.edge[np.arange(len(edge_ids)), edge_ids]
-        M = self._unpack(w.plane * self.plane + w.edge * self._by_capture(ends))
-        J = tangent_basis(x[:9].reshape(3, 3).T, 1)
+        rows = self._inside[np.arange(len(edge_ids)), edge_ids]
+        M = w.plane * self.plane + w.edge * self._mean_of_ends(rows[:, :, None] * rows[:, None])
+        J = tangent_basis(x[:9].reshape(3, 3).T)
         prior = np.zeros((7, 7))
         prior[6, 6] = EDGE_SHIFT_SIGMA_M**-2
         placement = np.arange(self.n_captures) if placement is None else placement
@@ -222,9 +193,6 @@ class Problem:
         Args:
             x: (B, 14).
         """
-        products = x[:, self._upper[0]] * x[:, self._upper[1]]
-        products[:, self._upper[0] != self._upper[1]] *= 2
-        plane = np.maximum(products @ self.plane.T, 0)
+        plane = np.maximum(np.sum((x @ self.plane) * x, axis=-1).T, 0)
         inside_m = self._board.inside_nearest_edge(self._on_board(x)) + x[:, 12, None]
-        edge = self._by_capture((inside_m**2 * self._edge_weight).T).T
-        return np.sqrt(plane), np.sqrt(edge)
+        return np.sqrt(plane), np.sqrt(self._mean_of_ends(inside_m.T**2).T)

@@ -33,21 +33,16 @@ def with_one(vectors: Array) -> Array:
     return np.concatenate([vectors, np.ones((*vectors.shape[:-1], 1))], axis=-1)
 
 
-def tangent_basis(R: Array, n_linear: int) -> Array:
-    """Differentiate x = [vec R; t; s; 1] by the tangent (translation, rotation, s), R = exp(phi^) R0.
-
-    Args:
-        R: (3, 3).
-        n_linear: length of s.
+def tangent_basis(R: Array) -> Array:
+    """Differentiate x = [vec R; t; d; 1] by the tangent (translation, rotation, d), R = exp(phi^) R (3, 3).
 
     Returns:
-        (13 + k, 6 + k).
+        (14, 7).
     """
-    J = np.zeros((13 + n_linear, 6 + n_linear))
-    # vec R moves by vec(e_k^ R0).
+    J = np.zeros((14, 7))
+    # vec R moves by vec(e_k^ R).
     J[:N_ROTATION, 3:6] = vec_rotation(skew(np.eye(3)) @ R).T
-    J[N_ROTATION:12, :3] = np.eye(3)
-    J[12 : 12 + n_linear, 6:] = np.eye(n_linear)
+    J[N_ROTATION:12, :3], J[12, 6] = np.eye(3), 1
     return J
 
 

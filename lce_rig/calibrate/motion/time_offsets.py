@@ -32,7 +32,6 @@ from lce_rig.calibrate.plane_and_ends import (
     along_normals,
     differentiate,
     extract_features,
-    features_of_camera,
 )
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.core.board import Board
@@ -128,7 +127,6 @@ def estimate_motion(
         samples,
         [extract_features(observation, board) for observation in swept],
         times_s,
-        board,
         start.problem.weights,
         precision=np.diag(prior_sigma_s**-2.0),
     )
@@ -150,7 +148,6 @@ class _Cost:
     samples: PoseSamples
     features: Sequence[CaptureFeatures]
     times_s: Array
-    board: Board
     weights: Weights
     precision: Array
 
@@ -158,8 +155,7 @@ class _Cost:
         """Solve for the extrinsics at offsets (C,), from T_cam_lidar (4, 4) nearby."""
         motions = fit_motions(self.samples, offset_s)
         poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
-        placed = [replace(f, **features_of_camera(T, cov, self.board)) for f, T, cov in poses]
-        problem = Problem(placed, self.board, self.weights)
+        problem = Problem([replace(f, T_cam_board=T, cov=cov) for f, T, cov in poses], self.weights)
         solution = problem.solve(np.ones((1, problem.n_captures)), T_start, 2)
         plane, edge = problem.errors(solution.x)
         cost = self.weights.plane * plane[0] ** 2 + self.weights.edge * edge[0] ** 2

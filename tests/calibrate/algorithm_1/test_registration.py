@@ -12,7 +12,6 @@ from lce_rig.calibrate.algorithm_1.registration import (
     minimise_on_so3,
     rotation_cost,
 )
-from lce_rig.calibrate.plane_and_ends import residual_rows
 from lce_rig.core.geometry import exp_so3, project_to_so3, rotation_angle
 
 
@@ -30,7 +29,10 @@ def make_planes(seed, sigma_m=0.0, n_boards=8, spread=0.5):
 
 
 def moments_of(normals, anchors, points):
-    rows = residual_rows(normals, anchors, points).reshape(-1, 13)
+    """Sum the squares of n . (g - R p - t) as moments of [vec R; t; 1]."""
+    lever = -(points[..., :, None] * normals[..., None, :]).reshape(*points.shape[:-1], 9)
+    offset = np.sum(normals * anchors, axis=-1, keepdims=True)
+    rows = np.concatenate([lever, -normals, offset], axis=-1).reshape(-1, 13)
     return rows.T @ rows / len(rows)
 
 
