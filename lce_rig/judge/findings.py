@@ -21,8 +21,7 @@ _OF_POSES = _OF_DISTANCES + (
 _UNLIKELY = 0.05
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
-    "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
-    "verdict.lidars_exchanged": _OF_POSES.split(),
+    "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
     "verdict.moved": _OF_POSES.split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
     "verdict.plate_edge": [
@@ -395,10 +394,10 @@ LASER_ANGLES = Kind(
     "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
     "check the LiDAR's model and beam table in its driver",
 )
-CAMERAS_EXCHANGED = Kind(
-    "verdict.cameras_exchanged",
+EXCHANGED = Kind(
+    "verdict.exchanged",
     "{subject} are exchanged: each fits the profile's {fits} of the other",
-    "check topics, ports or files of the cameras, and collect again",
+    "check topics, ports or files of both, and collect again",
 )
 CAMERAS_DIFFER = Kind(
     "verdict.cameras_differ",
@@ -410,11 +409,6 @@ LIDARS_DIFFER = Kind(
     "verdict.lidars_differ",
     "{subject}: their pose to each other and that by their poses to {camera} differ by " + _APART,
     "check whether a sensor has moved, and the board's size",
-)
-LIDARS_EXCHANGED = Kind(
-    "verdict.lidars_exchanged",
-    "{subject} are exchanged: their nominal pose in the profile fits the other way round",
-    "check topics, ports or files of the LiDARs, and collect again",
 )
 LIDARS_UNNAMED = Kind(
     "verdict.lidars_unnamed",

@@ -203,18 +203,15 @@ def judge_lens(
     return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
 
 
-def lens_findings(check: IntrinsicsCheck | None, target_deg: float) -> list[Finding]:
-    """Find given intrinsics that do not fit; none where they pass or were not compared."""
-    return [] if check is None or check.verdict(target_deg) == "pass" else [explain(check, target_deg)]
-
-
-def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
-    """Return the finding that the given intrinsics do not fit, and how they differ.
+def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> list[Finding]:
+    """Find given intrinsics that do not fit, and how they differ; none where they pass or were not compared.
 
     Args:
-        check: with a verdict other than "pass".
+        check: of the intrinsics.
         target_deg: target standard deviation of the extrinsics' rotation.
     """
+    if check is None or check.verdict(target_deg) == "pass":
+        return []
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Any] = {
         **asdict(check),
@@ -226,10 +223,10 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     if check.surprise is not None:
         # The result has the fitted intrinsics; only a lens that is hardly the profile's is a doubt.
         severity = "warning" if check.surprise > _OTHER_LENS else "note"
-        action = action if severity == "warning" else "weighed"
+        action = "" if severity == "warning" else "weighed"
     elif judgement.code == "intrinsics.undetermined":
         action = "collect"
-    return INTRINSICS(severity=severity, action=action, **figures)
+    return [INTRINSICS(severity=severity, action=action, **figures)]
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:

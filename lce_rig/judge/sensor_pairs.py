@@ -35,10 +35,9 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.detection import LidarDetection
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
-    CAMERAS_EXCHANGED,
+    EXCHANGED,
     FAIL_FACTOR,
     LIDARS_DIFFER,
-    LIDARS_EXCHANGED,
     LIDARS_UNNAMED,
     OTHER_MODEL,
     failing,
@@ -233,7 +232,7 @@ def find_exchanged_cameras(
         ]
         if all(check is not None and check.verdict() == "pass" for check in checks):
             reasons.append("lenses")
-    return [CAMERAS_EXCHANGED(f"{first.name} and {second.name}", fits=tuple(reasons))] if reasons else []
+    return [EXCHANGED(f"{first.name} and {second.name}", fits=tuple(reasons))] if reasons else []
 
 
 def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> float:
@@ -324,7 +323,7 @@ def find_exchanged_lidars(
         return max(rotation_deg / nominal.tolerance_deg, translation_m / nominal.tolerance_m)
 
     is_exchanged = excess(T_first_second) > 1 >= excess(invert(T_first_second))
-    return [LIDARS_EXCHANGED(names)] if is_exchanged else []
+    return [EXCHANGED(names, fits=("mounting",))] if is_exchanged else []
 
 
 def loop_findings(between: Calibration, first: Calibration, second: Calibration, rig: Rig) -> list[Finding]:

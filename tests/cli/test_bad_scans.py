@@ -189,7 +189,7 @@ def test_clouds_without_tags_are_used_whole(lce_rig, standing, tmp_path, has_dus
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "has_nominal", "finding"),
-    [("VLP-16", True, "verdict.lidars_exchanged"), ("OS1-64", False, "verdict.other_model")],
+    [("VLP-16", True, "verdict.exchanged"), ("OS1-64", False, "verdict.other_model")],
 )
 def test_lidars_under_each_others_name_fail(lce_rig, tmp_path, model, has_nominal, finding):
     profile = yaml.safe_load(TWO_LIDARS.read_text())

@@ -31,7 +31,7 @@ def calibrated(rig: Rig, session: Session, names: tuple[str, str]) -> list[Calib
 
 
 def exchanged(calibrations: list[Calibration]) -> list[tuple[object, ...]]:
-    found = [f for c in calibrations for f in c.findings if f.code == "verdict.cameras_exchanged"]
+    found = [f for c in calibrations for f in c.findings if f.code == "verdict.exchanged"]
     return [f.figures["fits"] for f in found]  # type: ignore[misc]
 
 
@@ -61,7 +61,7 @@ def test_alike_cameras_that_were_exchanged_are_found_by_their_mounting() -> None
     found = calibrated(RIG, session, (RIGHT, LEFT))
     assert exchanged(found) == [("mounting",)] * 2
     assert {c.verdict for c in found} == {"fail"}
-    assert {c.findings[0].code for c in found} == {"verdict.cameras_exchanged"}
+    assert {c.findings[0].code for c in found} == {"verdict.exchanged"}
 
 
 @pytest.mark.long

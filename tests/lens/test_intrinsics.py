@@ -11,7 +11,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
-from lce_rig.judge.intrinsics_check import check_intrinsics, explain, judge_lens
+from lce_rig.judge.intrinsics_check import check_intrinsics, judge_lens, lens_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, find_weaknesses, reach
@@ -249,7 +249,7 @@ def test_stale_intrinsics_fail_with_their_figures(views, kind):
     check = check_intrinsics(views, STALE[kind], BOARD)
     assert check.verdict() == "fail"
     assert check.rms_px > check.possible_px
-    found = explain(check)
+    (found,) = lens_findings(check)
     assert (found.code, found.severity) == ("verdict.intrinsics", "error")
     assert found.figures["displacement_px"] == check.displacement_px
     if kind == "centre ten pixels off":
@@ -261,7 +261,7 @@ def test_a_lens_that_draws_nothing_where_boards_are_seen_fails(views):
     folded = replace(WIDE, distortion=(-60.0, 0.0, 0.0, 0.0))
     check = check_intrinsics(views, folded, BOARD)
     assert check.verdict() == "fail"
-    assert not np.isfinite(explain(check).figure("displacement_px"))
+    assert not np.isfinite(lens_findings(check)[0].figure("displacement_px"))
 
 
 def test_a_lens_is_replaced_only_where_the_boards_determine_it_to_the_border(views):
@@ -277,24 +277,24 @@ def test_a_lens_is_replaced_only_where_the_boards_determine_it_to_the_border(vie
     assert judgement.code == "intrinsics.undetermined"
     assert judgement.figures["covered"] < 0.3
     assert judgement.figures["image_sigma_px"] > judgement.figures["limit_px"] >= 1.0
-    assert explain(middle).action == "collect"
+    assert lens_findings(middle)[0].action == "collect"
 
 
 def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views):
     slight = replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px)
     check = check_intrinsics(views, slight, BOARD)
     assert check.verdict() == "marginal"
-    assert explain(check).severity == "warning"
+    assert lens_findings(check)[0].severity == "warning"
     assert check.verdict(target_deg=0.05) == "fail"
     assert check.verdict(target_deg=1.0) == "pass"
 
 
 def test_a_displacement_of_pixels_within_its_noise_is_not_stated_as_one(views):
     check = check_intrinsics(views, replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px), BOARD)
-    assert explain(check).figures["is_displaced"]
+    assert lens_findings(check)[0].figures["is_displaced"]
     within = replace(check, displacement_px=0.3, displacement_sigma_px=0.5, turn_deg=0.0)
     within = replace(within, rms_px=0.1, possible_px=0.1, surprise=40.0, is_contradicted=True)
-    found = explain(within)
+    (found,) = lens_findings(within)
     assert not found.figures["is_displaced"]
     assert found.severity == "warning" and "+-" not in found.text
 
