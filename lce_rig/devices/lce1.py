@@ -175,25 +175,6 @@ class LineReader:
         return messages
 
 
-def set_trigger(channel: int, rate_hz: float, phase_us: int, pulse_us: int) -> bytes:
-    """Write the command that sets the pulses of a line; a rate of 0 ends them."""
-    return write_sentence(f"LCERT,{channel},{rate_hz:.6f},{phase_us},{pulse_us}")
-
-
-def set_utc(t_us: int, utc_s: int) -> bytes:
-    """Write the command that tells which UTC second begins at a moment of the board's clock."""
-    return write_sentence(f"LCEUT,{t_us},{utc_s}")
-
-
-def ask_time(cookie: int) -> bytes:
-    """Write the command that asks for the board's time."""
-    return write_sentence(f"LCETM?,{cookie}")
-
-
-ASK_HELLO = write_sentence("LCEHI?")
-START = write_sentence("LCEGO")
-
-
 # An answer that takes longer came while the computer's clock was set.
 _MAX_ROUND_TRIP_NS = 2 * NS_PER_S
 # Messages are out of order by less; a board whose time goes back further has restarted.

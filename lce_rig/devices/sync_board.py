@@ -54,7 +54,7 @@ class SyncBoard(LiveSource):
         self._lock = threading.Lock()
         self._early: list[Pulse] = []
         self._heard = b""
-        self._outbox: deque[bytes] = deque()
+        self._outbox: deque[str] = deque()
         self._rate_hz: float | None = None
         self._n_restarts = self._cookie = 0
         self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
@@ -172,13 +172,13 @@ class SyncBoard(LiveSource):
             self._rate_hz = rate_hz
             self._set_lines()
 
-    def _write(self, data: bytes) -> int:
-        """Send a command; gives the time of day in ns when it went out."""
+    def _write(self, command: str) -> int:
+        """Send a command's name and fields; gives the time of day in ns when it went out."""
         assert self._port is not None  # it is open
         sent_ns = time.time_ns()
         # A board that takes no commands gives no answers either, which is reported.
         with self._reaching_board(), suppress(serial.SerialTimeoutException):
-            self._port.write(data)
+            self._port.write(lce1.write_sentence(command))
         return sent_ns
 
     @contextmanager
@@ -214,17 +214,17 @@ class SyncBoard(LiveSource):
         """Queue the commands that set the lines, for a board that knows nothing yet."""
         for trigger in self._settings.triggers.values():
             rate_hz = self._rate_hz or trigger.rate_hz
-            command = lce1.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
-            self._outbox.append(command)
+            line = f"{trigger.channel},{rate_hz:.6f},{trigger.phase_us},{trigger.pulse_us}"
+            self._outbox.append(f"LCERT,{line}")
         if self._settings.triggers:
-            self._outbox.append(lce1.START)
+            self._outbox.append("LCEGO")
 
     def _talk(self, now_ns: int) -> None:
         """Send the greetings, commands, UTC and time requests that are due."""
         if not self._is_set_up:
             if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
                 self._greeted_ns = now_ns
-                self._write(lce1.ASK_HELLO)
+                self._write("LCEHI?")
             return
         while self._outbox:
             self._write(self._outbox.popleft())
@@ -235,7 +235,7 @@ class SyncBoard(LiveSource):
             self._asked_ns = now_ns
             self._cookie += 1
             # The answer is read by this same thread: it cannot overtake the note.
-            self._state.asked(self._cookie, self._write(lce1.ask_time(self._cookie)))
+            self._state.asked(self._cookie, self._write(f"LCETM?,{self._cookie}"))
 
     def _tell_utc(self, now_ns: int) -> None:
         """Tell a board that has no receiver when a second begins, by the computer's time of day."""
@@ -247,4 +247,5 @@ class SyncBoard(LiveSource):
         board_clock = model.inverse()
         if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
             self._told_utc_ns = now_ns
-            self._write(lce1.set_utc(round(board_clock.convert(utc_s * NS_PER_S) / 1000), utc_s))
+            board_us = round(board_clock.convert(utc_s * NS_PER_S) / 1000)
+            self._write(f"LCEUT,{board_us},{utc_s}")

@@ -209,15 +209,12 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
             n_lost = board.status.n_lost_by_line.get(line, 0)
             rate_hz = 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
         figures: dict[str, Any] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
-        if not rate_hz:
+        if abs(rate_hz / expected_hz - 1) > _MAX_OFF_PULSES:
             # The driver says that the pulse per second is missing.
-            severity: Severity = "note" if line == PPS_LINE else "error"
-            yield findings.LINE_NONE(**figures, severity=severity, action=action)
-        elif abs(rate_hz / expected_hz - 1) > _MAX_OFF_PULSES:
-            yield findings.LINE_OFF(**figures, action=action)
+            severity: Severity = "warning" if rate_hz else "note" if line == PPS_LINE else "error"
+            yield findings.LINE_OFF(**figures, severity=severity, action=action)
         else:
             yield findings.LINE(**figures)
-    yield findings.PULSES_LOST(n=board.status.n_lost)
     yield from exam.problems(BOARD, "stream")
 
 

@@ -94,13 +94,6 @@ LINE_OFF = warning_kind(
     "check sync.triggers.{line}, reset the board",
     actions={"pps": "reset the board"},
 )
-LINE_NONE = Kind(
-    "pulses.line_none",
-    "{line} none ({expected_hz:g} Hz expected)",
-    "check sync.triggers.{line}, reset the board",
-    actions={"pps": ""},
-)
-PULSES_LOST = note_kind("pulses.lost", "{n} lost")
 FRAMES_OF_PULSES = note_kind("pulses.frames", "{n_frames} images of {n_pulses} pulses")
 UNEQUAL = Kind(
     "pulses.unequal",
