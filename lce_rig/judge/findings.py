@@ -341,7 +341,7 @@ PLATE_EDGE = Kind(
 INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,
-    "if rough, changed or refocused: " + _SAVE,
+    "if rough or changed: " + _SAVE,
     actions={
         "collect": "cover the corners, then " + _SAVE,
         "weighed": "use the result's, or " + _SAVE,
@@ -450,6 +450,6 @@ REPEAT_DISAGREE = Kind(
     "do not use any of them until the cause is known",
     actions={
         "odd_one": "find the fault in {odd_one}, without it the others agree",
-        "overlays": "compare the overlays of {first} and {second}: `lce-rig verify {session} --name NAME`",
+        "overlays": "compare overlays of {first} and {second}: `lce-rig verify {session} --name NAME`",
     },
 )
