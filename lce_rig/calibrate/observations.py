@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.rig import Rig
 
@@ -118,21 +119,26 @@ def scan_key(observation: Observation) -> bytes:
 
 
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
+    """Number the board placements (F,) of captures by the camera's poses of the board."""
+    poses = np.array([observation.image.T_cam_board for observation in observations])
+    return group_poses(poses.reshape(-1, 4, 4))
+
+
+def group_poses(T: Array) -> NDArray[np.intp]:
     """Number the board placements of captures; captures that stood in the same place share a number.
 
     A capture joins the first placement whose first capture has its centre and normal nearby.
 
     Args:
-        observations: with the camera's pose of the board.
+        T: (F, 4, 4) of the board, in the frame of one sensor.
 
     Returns:
         (F,) numbers from 0.
     """
-    T = np.array([observation.image.T_cam_board for observation in observations]).reshape(-1, 4, 4)
-    numbers = np.zeros(len(observations), dtype=np.intp)
+    numbers = np.zeros(len(T), dtype=np.intp)
     firsts: list[int] = []
-    for k, T_cam_board in enumerate(T):
-        apart = np.linalg.norm(T[firsts] - T_cam_board, axis=1)
+    for k, T_sensor_board in enumerate(T):
+        apart = np.linalg.norm(T[firsts] - T_sensor_board, axis=1)
         is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
         if is_same.any():
             numbers[k] = np.argmax(is_same)
@@ -140,32 +146,3 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
             numbers[k] = len(firsts)
             firsts.append(k)
     return numbers
-
-
-def group_shared_placements(
-    cameras: Sequence[Sequence[Observation]], order: Mapping[str, int]
-) -> NDArray[np.intp]:
-    """Number the board placements of captures that several cameras share.
-
-    Captures in the same place for one camera are one placement, for any other cameras.
-
-    Args:
-        cameras: observations of each.
-        order: place of each capture by name, 0 to F - 1.
-
-    Returns:
-        (F,) numbers from 0.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    n_captures, links = len(order), []
-    for k, camera in enumerate(cameras):
-        # Each placement of a camera is a node beside those of the captures.
-        placement = group_placements(camera) + n_captures * (k + 1)
-        links += [(order[o.capture], number) for o, number in zip(camera, placement, strict=True)]
-    n_nodes = n_captures * (len(cameras) + 1)
-    graph = coo_array((np.ones(len(links)), np.array(links).T), shape=(n_nodes, n_nodes))
-    _, component = connected_components(graph, directed=False)
-    _, first, inverse = np.unique(component[:n_captures], return_index=True, return_inverse=True)
-    return np.asarray(np.argsort(np.argsort(first))[inverse], dtype=np.intp)

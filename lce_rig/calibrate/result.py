@@ -123,11 +123,6 @@ class CalibrationEstimate:
         """Errors over all captures used, of the boards as measured."""
         return summarise(self.residuals)
 
-    @property
-    def held_out_m(self) -> float:
-        """Mean over captures of `CaptureResidual.held_out_m`."""
-        return float(np.mean([residual.held_out_m for residual in self.residuals]))
-
     def captures_of(self, names: Iterable[str]) -> set[str]:
         """Name every capture that holds the scan of one of the captures named."""
         return {capture for name in names for capture in self.same_scan.get(name, (name,))}

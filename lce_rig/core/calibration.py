@@ -384,7 +384,6 @@ class Calibration:
         board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
-        held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """
@@ -434,7 +433,6 @@ class Calibration:
         | None
     ) = None
     board_distances_m: tuple[Size, ...] = ()
-    held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)
 

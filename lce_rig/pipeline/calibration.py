@@ -429,7 +429,6 @@ def _judged(
             if link.pair is not None
         ),
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
-        held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
     )

@@ -154,7 +154,6 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
         diagnostics=estimate.diagnostics,
         method=estimate.method,
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
-        held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations={name: _seen_from(invert(T_view), o) for name, o in estimate.observations.items()},
     )

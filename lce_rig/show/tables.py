@@ -121,7 +121,7 @@ def _fit_rows(c: Calibration) -> list[Row]:
         ("captures in which both sensors found the board", f"{c.n_detected} of {c.n_captures}"),
         (f"LiDAR points from the board planes of {first}, mean", f"{1000 * c.metrics.mpe_m:.1f} mm"),
         ("ring ends from the board's edges, mean", f"{1000 * c.metrics.mee_m:.1f} mm"),
-        ("held-out captures, rms", f"{1000 * c.held_out_m:.1f} mm"),
+        ("held-out captures, rms", f"{1000 * c.diagnostics.held_out_m:.1f} mm"),
         (
             "corners from the board's best pose in each image, rms",
             f"{c.metrics.reprojection_px:.2f} px",

@@ -17,7 +17,7 @@ from lce_rig.calibrate.likelihood.layout import State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, evidence, linearise
 from lce_rig.calibrate.likelihood.rays import interior, lens_fields, stack_scans
-from lce_rig.calibrate.observations import group_shared_placements
+from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
@@ -135,7 +135,7 @@ def maximise_likelihood(
         images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]
     T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (by_name[name] for name in order)])
     state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings))
-    placement = group_shared_placements(cameras, order)
+    placement = group_poses(T_lidar_board)
     terms = linearise(scans, images, board, state, _once(placement, images))
     return _maximise(terms, priors or Priors(), usual or Levels(), placement)
 

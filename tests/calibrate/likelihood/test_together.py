@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.observations import group_placements, group_shared_placements
 from lce_rig.calibrate.together import calibrate_together
 from lce_rig.core.geometry import difference, relative_pose
-from tests.calibrate.boards import BOARD, simulate
+from tests.calibrate.boards import BOARD
 from tests.calibrate.test_tolerances import KNOWN
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
 
@@ -122,16 +121,6 @@ def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
         assert len(estimate.residuals) == len(estimate.used)
         refusal = estimate.refused["000002"]
         assert (refusal.code, refusal.figures) == ("pair.two_places", {"first": "left", "second": "right"})
-
-
-def test_placements_are_those_of_any_camera():
-    """The second camera sees captures 1 and 2 in one place, the first does not see 2 at all."""
-    observations = simulate(4, 0)
-    order = {o.capture: k for k, o in enumerate(observations)}
-    first = [observations[k] for k in (0, 1, 3)]
-    second = [replace(observations[1], capture=observations[k].capture) for k in (1, 2)]
-    assert group_shared_placements([first, second], order).tolist() == [0, 1, 1, 2]
-    assert np.array_equal(group_shared_placements([observations], order), group_placements(observations))
 
 
 @pytest.mark.slow
