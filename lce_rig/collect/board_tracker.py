@@ -201,7 +201,8 @@ class BoardTracker:
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         known = self._candidates.get(scan.sensor, [])
-        followed = self.finder.follow_scan(scan, known) if known else None
+        poses = [board.T_lidar_board for board in known]
+        followed = self.finder.look_in_scan(scan, poses) if poses else None
         n_found = len(followed.located) if followed is not None and isinstance(followed.located, list) else 0
         are_all_there = n_found == self._n_candidates.get(scan.sensor)
         interval_s = max(_SEARCH_S, self.rescan_interval_s if are_all_there else 0.0)

@@ -17,7 +17,7 @@ class ImageQuality:
 
     Attributes:
         contrast: white minus black squares, grey values.
-        square_px: shortest side of a square.
+        square_px: shortest side of a square; 0 where no two neighbours are visible.
         edge_width_px: of the squares' edges, 10-90 %.
         sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
         border_px: outermost corner to the border of the image.

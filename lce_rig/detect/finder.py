@@ -130,27 +130,18 @@ class BoardFinder:
         find = find_lidar_boards if self.rig.lidars[scan.sensor].has_rings else find_unstructured_boards
         return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
 
-    def follow_scan(self, scan: Scan, last: Sequence[LidarBoard]) -> Search[list[LidarBoard]]:
-        """Find surfaces near where they were in the scan before; lost ones are omitted.
+    def look_in_scan(self, scan: Scan, poses: Sequence[Array]) -> Search[list[LidarBoard]]:
+        """Find surfaces about poses T_lidar_board (4, 4), those of the scan before or predicted ones.
 
         Args:
-            scan: the next one of the same LiDAR.
-            last: what the search before located, at least one.
+            scan: of a LiDAR of the rig.
+            poses: at least one; those about which nothing is found are omitted.
         """
-        looked = [self._located(scan, previous.T_lidar_board) for previous in last]
-        boards = [result for result in looked if isinstance(result, LidarBoard)]
-        lost = [result for result in looked if isinstance(result, Refusal)]
-        return self._compared(boards or lost[0], scan)
-
-    def look_for(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
-        """Find the board in a scan about a predicted pose (4, 4)."""
-        located = self._located(scan, T_lidar_board)
-        usable = self._compared(located if isinstance(located, Refusal) else [located], scan).usable
-        return usable if isinstance(usable, Refusal) else usable[0]
-
-    def _located(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
         look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
-        return look(scan, self.board, T_lidar_board, self._limits(scan.sensor))
+        looked = [look(scan, self.board, pose, self._limits(scan.sensor)) for pose in poses]
+        boards = [result for result in looked if isinstance(result, LidarBoard)]
+        missing = [result for result in looked if isinstance(result, Refusal)]
+        return self._compared(boards or missing[0], scan)
 
     def _limits(self, sensor: str) -> Limits:
         lidar, quality = self.rig.lidars[sensor], self.rig.quality

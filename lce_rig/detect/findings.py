@@ -10,7 +10,6 @@ _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
 _WHOLE = "show the whole pattern; correct board.inner_corners (squares less one)"
 _UNCOVER = "uncover the pattern, come closer, or correct board.inner_corners"
-_FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "flatten the board, or `lce-rig intrinsics {session} --save-profile FILE`"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
 
@@ -61,18 +60,6 @@ IMAGE_OVEREXPOSED = Kind(
     "image.overexposed",
     "overexposed: {white_share:percent} of the image is white",
     "expose shorter or turn the board away from the light",
-)
-IMAGE_FLAT = Kind(
-    "image.flat",
-    "contrast too low: grey values {grey_1:.0f} to {grey_99:.0f}, no " + _CORNERS + " detected",
-    "light the board, expose longer",
-    actions={"events": "move the board while events are recorded, only moving edges make them"},
-)
-IMAGE_BLURRED = Kind(
-    "image.blurred",
-    "too blurred: the sharpest edges are {edge_px:.0f} px wide, no " + _CORNERS + " detected",
-    "hold the board still, expose shorter, focus the lens",
-    actions={"events": MOVE_SLOWLY},
 )
 IMAGE_NO_BOARD = Kind(
     "image.no_board",
@@ -128,12 +115,11 @@ IMAGE_LOW_CONTRAST = Kind(
     "expose longer or add light",
     actions={"events": MOVE_SLOWLY},
 )
-IMAGE_NOT_SHARP = Kind(
-    "image.not_sharp",
-    "too blurred: edges {edge_px:.1f} px wide on squares of {square_px:.1f} px "
-    "(minimum {min_sharpness:g} edge widths per square)",
-    _FOCUS,
-    actions={"events": _CLOSER},
+IMAGE_BLURRED = Kind(
+    "image.blurred",
+    "too blurred: edges {edge_px:.1f} px wide (limit {max_edge_px:.1f} px)",
+    "hold the board still, expose shorter, come closer, focus the lens",
+    actions={"events": MOVE_SLOWLY + "; come closer"},
 )
 IMAGE_NO_POSE = Kind("image.no_pose", "the corners fit no pose of the board in front of the camera", _LENS)
 IMAGE_MISFIT = Kind(

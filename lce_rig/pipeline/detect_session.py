@@ -164,10 +164,8 @@ class _Finder:
         """Find the board in a scan about one of the predicted poses T_lidar_board (4, 4)."""
 
         def find() -> LidarDetection:
-            scan = capture.scan(lidar)
-            found = [self._boards.look_for(scan, pose) for pose in poses]
-            boards = [each for each in found if not isinstance(each, Refusal)]
-            return boards[:1] or next(each for each in found if isinstance(each, Refusal))
+            found = self._boards.look_in_scan(capture.scan(lidar), poses).usable
+            return found if isinstance(found, Refusal) else found[:1]
 
         where = hashlib.sha256(np.round(np.stack(poses), 3).tobytes()).hexdigest()[:12]
         return self._remembered(self._digest, capture, f"{lidar}.at-{where}", find)

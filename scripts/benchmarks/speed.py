@@ -44,7 +44,8 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
         milliseconds(lambda k: BoardFinder(rig).scan(scans[k])),
     )
     boards = [result if isinstance(result, list) else [] for result in found]
-    yield "tracked, median", milliseconds(lambda k: BoardFinder(rig).follow_scan(scans[k], boards[k]))
+    poses = [[each.T_lidar_board for each in of_scan] for of_scan in boards]
+    yield "tracked, median", milliseconds(lambda k: BoardFinder(rig).look_in_scan(scans[k], poses[k]))
     yield (
         "board in a 1280x720 picture, median",
         milliseconds(lambda k: BoardFinder(rig).image(pictures[k])),

@@ -27,9 +27,7 @@ def test_boards_of_both_sensors_come_back_as_they_were():
 
 
 def test_a_refusal_comes_back_as_it_was():
-    refusal = Refusal(
-        "image.flat", figures={"n_cols": 9, "n_rows": 6, "grey_1": 1.5, "grey_99": 30.0}, action="events"
-    )
+    refusal = Refusal("image.low_contrast", figures={"contrast": 28.5, "min_contrast": 50.0}, action="events")
     assert from_arrays(to_arrays(refusal)) == refusal
 
 
@@ -41,7 +39,7 @@ def test_arrays_that_are_no_detection_are_refused():
 
 
 def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
-    refusal = Refusal("image.flat")
+    refusal = Refusal("image.low_contrast")
     images = {
         ("cam", "frames"): {"000000": refusal, "000001": refusal},
         ("cam", "events"): {"000002": refusal},

@@ -125,7 +125,6 @@ def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(st
     [
         ({"max_board_speed_mps": 0.05}, "image.too_fast", "max_speed_mps"),
         ({"min_events_px": 1e3}, "image.hardly_moved", "min_events_px"),
-        ({"min_event_sharpness": 50.0}, "image.not_sharp", "min_sharpness"),
         ({"min_event_contrast": 300.0}, "image.low_contrast", "min_contrast"),
     ],
 )
@@ -145,3 +144,10 @@ def test_a_board_that_moves_far_during_its_scan_of_20_ms_is_too_fast(detection):
 def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):
     bare = find_image_board(detection[0], BOARD, CAMERA, limits=LIMITS, is_from_events=True)
     assert gate_event_board(bare, LIMITS) is bare
+
+
+def test_squares_of_too_few_edge_widths_are_refused_by_the_widest_edge_that_would_do(detection):
+    limits = LIMITS.model_copy(update={"min_event_sharpness": 50.0})
+    refusal = find_image_board(detection[0], BOARD, CAMERA, limits=limits, is_from_events=True)
+    assert refusal.code == "image.blurred"
+    assert refusal.figures["max_edge_px"] == pytest.approx(SQUARE_PX / 50, rel=0.05)

@@ -175,7 +175,7 @@ def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures()
     for pixels, code in (
         (np.clip(10 + noise, 0, 255).astype(np.uint8), "image.too_dark"),
         (np.full((260, 346), 255, np.uint8), "image.overexposed"),
-        (np.clip(140 + noise, 0, 255).astype(np.uint8), "image.flat"),
+        (np.clip(140 + noise, 0, 255).astype(np.uint8), "image.low_contrast"),
         (draw(ASYMMETRIC, DAVIS, T, blur_px=9.0), "image.blurred"),
         (np.tile(stripes, (260, 1)), "image.no_board"),
     ):
@@ -186,7 +186,7 @@ def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures()
 def test_an_empty_event_picture_asks_for_motion():
     grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
     result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS, is_from_events=True)
-    assert (result.code, result.action) == ("image.flat", "events")
+    assert (result.code, result.action) == ("image.low_contrast", "events")
 
 
 def test_intrinsics_of_another_resolution_are_refused_naming_both_sizes():

@@ -13,8 +13,6 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, difference, pose, rotation_angle, transform
 from lce_rig.core.pattern import markers_of
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.image.quality import grid_quality
-from lce_rig.detect.image.saddle import Crossings
 from lce_rig.detect.image.search import find_image_board
 from tests.detect.drawn_boards import DAVIS, FISHEYE, WIDE, draw, looking, picture
 
@@ -165,17 +163,6 @@ def test_another_family_of_apriltags_is_named(family):
     )
     assert isinstance(result, Refusal) and result.code == "image.other_dictionary"
     assert result.figures["seen_dictionary"] == family
-
-
-def test_the_side_of_a_square_is_measured_where_no_two_neighbours_are_visible():
-    rows, columns = np.indices((6, 8))
-    grid_px = np.where(
-        (rows + columns)[..., None] % 2, np.nan, 20.0 * np.stack([columns, rows], axis=-1) + 50
-    )
-    ones = np.ones((6, 8))
-    crossings = Crossings(grid_px, np.isfinite(grid_px[..., 0]), ones, np.ones((6, 8, 2)), ones)
-    quality = grid_quality(np.zeros((300, 300), np.uint8), crossings)
-    assert quality.square_px == pytest.approx(20.0)
 
 
 @pytest.mark.long

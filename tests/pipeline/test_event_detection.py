@@ -118,7 +118,7 @@ def test_another_scan_under_the_same_name_gives_another_picture(tmp_path, stream
 def test_a_stored_picture_is_taken(tmp_path, stream):
     blank = Image("dvs", "events", SCAN_NS, np.full((HEIGHT_PX, WIDTH_PX), 128, np.uint8))
     session = session_of(tmp_path, stream, images=[blank])
-    assert found_in(session).code == "image.flat"
+    assert found_in(session).code == "image.low_contrast"
 
 
 def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):

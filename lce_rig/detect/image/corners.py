@@ -70,11 +70,10 @@ def seen_grid(grey: Grey) -> Array | None:
     """
     width = grey.shape[1]
     scale = _SEARCH_PX / width if width > _WIDE_PX else _MOST_SCALE
-    level = level_contrast(_resize(grey, scale))
+    level = level_contrast(resize(grey, scale))
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(level, (5, 4), flags)
-    full = _to_full_scale(corners, scale) if is_found else None
-    return None if full is None else full.reshape(*meta.shape[:2], 2)
+    return to_full_scale(corners, scale).reshape(*meta.shape[:2], 2) if is_found else None
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
@@ -153,20 +152,20 @@ def level_contrast(grey: Grey) -> Grey:
 
 def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
     """Run `cv2.findChessboardCornersSB` (A. Duda, U. Frese, BMVC 2018) at a scale of the image."""
-    is_found, corners = cv2.findChessboardCornersSB(_resize(grey, scale), size, flags=flags)
-    return _to_full_scale(corners, scale) if is_found else None
+    is_found, corners = cv2.findChessboardCornersSB(resize(grey, scale), size, flags=flags)
+    return to_full_scale(corners, scale) if is_found else None
 
 
-def _resize(grey: Grey, scale: float) -> Grey:
+def resize(grey: Grey, scale: float) -> Grey:
+    """Scale an image; cubic where it grows, by areas where it shrinks."""
     if scale == 1.0:
         return grey
     how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
 
 
-def _to_full_scale(corners: NDArray[Any] | None, scale: float) -> Array | None:
-    if corners is None:
-        return None
+def to_full_scale(corners: NDArray[Any], scale: float) -> Array:
+    """Take corners of an image at a scale to (N, 2) px of the whole one."""
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
 
@@ -186,7 +185,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
     Returns:
         (rows * cols, 2) px, row by row, to about half a pixel; None if no such grid is found.
     """
-    points, edges, strengths = _saddle_points(_resize(grey, scale))
+    points, edges, strengths = _saddle_points(resize(grey, scale))
     if len(points) < size[0] * size[1]:
         return None
     places = _follow_links(_link(points, edges, strengths), size[0] * size[1])
@@ -200,7 +199,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
     grid = np.empty((n_rows, n_columns, 2))
     grid[cells[:, 1], cells[:, 0]] = points[list(places)]
     grid = grid if (n_columns, n_rows) == size else grid.swapaxes(0, 1)
-    return _to_full_scale(grid, scale)
+    return to_full_scale(grid, scale)
 
 
 def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:

@@ -24,7 +24,7 @@ from lce_rig.detect.findings import (
     IMAGE_OTHER_LAYOUT,
     IMAGE_OTHER_SPACING,
 )
-from lce_rig.detect.image.corners import Grey
+from lce_rig.detect.image.corners import Grey, resize, to_full_scale
 from lce_rig.detect.image.saddle import REACH, Crossings, Patches, fit_crossings
 
 Places = dict[int, Array]
@@ -159,15 +159,10 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
     parameters.errorCorrectionRate = 1.0
     parameters.adaptiveThreshConstant = darker
     book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
-    image = grey
-    if scale != 1.0:
-        how = cv2.INTER_CUBIC
-        image = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
-    corners, ids, _ = cv2.aruco.ArucoDetector(book, parameters).detectMarkers(image)
+    corners, ids, _ = cv2.aruco.ArucoDetector(book, parameters).detectMarkers(resize(grey, scale))
     if ids is None:
         return {}
-    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
-    full = [(np.asarray(four[0], dtype=np.float64) + 0.5) / scale - 0.5 for four in corners]
+    full = [to_full_scale(four, scale) for four in corners]
     return dict(zip(ids.ravel().tolist(), full, strict=True))
 
 

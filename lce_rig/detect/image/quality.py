@@ -10,10 +10,8 @@ from lce_rig.core.results import ImageQuality
 from lce_rig.detect.findings import (
     IMAGE_BLURRED,
     IMAGE_CUT_OFF,
-    IMAGE_FLAT,
     IMAGE_LOW_CONTRAST,
     IMAGE_NO_BOARD,
-    IMAGE_NOT_SHARP,
     IMAGE_OTHER_BOARD,
     IMAGE_OVEREXPOSED,
     IMAGE_PART,
@@ -32,6 +30,8 @@ LEAST_MARKED_PX = 20.0
 """Least side of a square with a marker, or of a tag, from which markers are read without fail."""
 # Of camera images: least difference of black and white, grey values, and fewest edge widths in a square.
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
+# Of images without a board: least grey spread, and widest of the strongest edges.
+_MIN_SPREAD, _MAX_EDGE_PX = 50.0, 6.0
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
 
@@ -41,7 +41,8 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
     grid = crossings.grid_px
     height, width = grey.shape
     is_seen = np.isfinite(grid[..., 0])
-    square_px = _shortest_side_px(grid)
+    sides = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
+    square_px = float(np.nanmin(sides)) if np.isfinite(sides).any() else 0.0
     edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
     alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
     contrast = float(abs(np.median(alternating[is_seen])))
@@ -54,19 +55,6 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
         border_px=float(to_border),
         n_corners=int(crossings.is_fitted.sum()),
     )
-
-
-def _shortest_side_px(grid_px: Array) -> float:
-    """Measure the shortest side of a square; where no two neighbours are visible, by other corners."""
-    sides = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    lengths = np.concatenate(sides)
-    if np.isfinite(lengths).any():
-        return float(np.nanmin(lengths))
-    places = np.argwhere(np.isfinite(grid_px[..., 0]))
-    seen_px = grid_px[tuple(places.T)]
-    first, second = np.triu_indices(len(places), k=1)
-    n_sides = np.linalg.norm(places[first] - places[second], axis=-1)
-    return float(np.min(np.linalg.norm(seen_px[first] - seen_px[second], axis=-1) / n_sides))
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
@@ -130,11 +118,13 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
         return explain_other_grid(grey, board, seen, is_from_events)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}
     action = "events" if is_from_events else ""
-    if bright - low < 50:
-        return IMAGE_FLAT.refusal(action=action, **wanted, grey_1=low, grey_99=bright)
-    width_px = strongest_edge_px(grey, bright - low)
-    if width_px > 6:
-        return IMAGE_BLURRED.refusal(action=action, **wanted, edge_px=width_px)
+    if bright - low < _MIN_SPREAD:
+        return IMAGE_LOW_CONTRAST.refusal(action=action, contrast=bright - low, min_contrast=_MIN_SPREAD)
+    # The width of the strongest edges: grey spread over the 99.9 percentile of the gradient.
+    dv, du = np.gradient(grey.astype(np.float32))
+    edge_px = (bright - low) / max(float(np.percentile(np.hypot(du, dv), 99.9)), 1e-3)
+    if edge_px > _MAX_EDGE_PX:
+        return IMAGE_BLURRED.refusal(action=action, edge_px=edge_px, max_edge_px=_MAX_EDGE_PX)
     return IMAGE_NO_BOARD.refusal(action=action, **wanted, grey_50=dark)
 
 
@@ -187,17 +177,6 @@ def quality_problem(
     if quality.contrast < min_contrast:
         return IMAGE_LOW_CONTRAST.refusal(action=action, contrast=quality.contrast, min_contrast=min_contrast)
     if quality.sharpness < min_sharpness:
-        figures = {
-            "edge_px": quality.edge_width_px,
-            "square_px": quality.square_px,
-            "sharpness": quality.sharpness,
-            "min_sharpness": min_sharpness,
-        }
-        return IMAGE_NOT_SHARP.refusal(action=action, **figures)
+        max_edge_px = quality.square_px / min_sharpness
+        return IMAGE_BLURRED.refusal(action=action, edge_px=quality.edge_width_px, max_edge_px=max_edge_px)
     return None
-
-
-def strongest_edge_px(grey: NDArray[np.uint8], spread: float) -> float:
-    """Measure the width of the strongest edges: grey spread over the 99.9 percentile of the gradient."""
-    dv, du = np.gradient(grey.astype(np.float32))
-    return spread / max(float(np.percentile(np.hypot(du, dv), 99.9)), 1e-3)

@@ -132,16 +132,7 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
         solved: both poses that they admit.
         quality: figures of the image.
     """
-    return ImageBoard(
-        corners_px=corners_px,
-        T_cam_board=solved.T_cam_board,
-        cov=solved.cov,
-        T_cam_board_alternative=solved.T_cam_board_alternative,
-        chi2_gap=solved.chi2_gap,
-        reprojection_px=solved.reprojection_px,
-        sigma_px=solved.sigma_px,
-        quality=quality,
-    )
+    return ImageBoard(corners_px, **solved._asdict(), quality=quality)
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:

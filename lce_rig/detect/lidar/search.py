@@ -26,15 +26,13 @@ from lce_rig.detect.lidar.segments import OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import (
     Placement,
     PlaneView,
-    beams_about,
     lost_share,
     plane_axes,
-    view_plane,
 )
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
-SCATTER_M = 0.02  # by how much more than the LiDAR's noise a moving board's returns may scatter to be named
+SCATTER_M = 0.02  # by how much more than the LiDAR's noise returns of a plate may scatter to be named
 # Sum of |log| of the ratios of long and short side up to which a plate is worth naming.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
@@ -115,14 +113,8 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
         limits: with the scan's noise.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
-    plates, ends = propose_plates(coarse, cut_segments(coarse, limits.max_range_m), board, is_any_size=True)
-    for plane, centre, placement in screen_plates(plates, ends, board, limits.template_m):
-        radius_m = float(np.hypot(*placement.half_m))
-        view = view_plane(scan.points, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
-        distance = placement.distance_m(view.uv)
-        heights_m = view.height_m[(distance < -0.03) & view.is_on]
-        if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
-            return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)
+    segments = cut_segments(coarse, limits.max_range_m)
+    plates, _ = propose_plates(coarse, segments, board, is_any_size=True)
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
     misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
     misfit[plates.n_rings < 3] += 1.0
