@@ -293,9 +293,11 @@ def laser_angles(joint: JointEstimate) -> dict[str, float]:
 
     Returns:
         Rms over rings of the errors about their mean in deg, by "azimuth" and "elevation": the noise is
-        subtracted, rings count by their information; 0 where noise alone explains them.
+        subtracted, rings count by their information; 0 where noise alone explains them. None without rings.
     """
     cost, z, layout = joint.cost, joint.state.z, joint.state.layout
+    if layout.n_rings < 2:
+        return {}
     of_angles = layout.lasers[1:].ravel()
     information, gradient = cost.information.copy(), np.zeros(len(z))
     information[of_angles[:, None], of_angles] -= cost.prior[of_angles[:, None], of_angles]
@@ -310,7 +312,7 @@ def laser_angles(joint: JointEstimate) -> dict[str, float]:
         about_mean = np.eye(len(at)) - weights / weights.sum()
         errors, variances = about_mean @ x[at], np.diag(about_mean @ own @ about_mean.T)
         is_sure = chance_of(float(x[at] @ np.linalg.solve(own, x[at])), len(at)) < _CHANCE
-        excess = np.average((errors**2 - variances), weights=variances**-2.0) if is_sure else 0.0
+        excess = np.average(errors**2 - variances, weights=variances**-2.0) if is_sure else 0.0
         sizes[name] = float(np.degrees(np.sqrt(max(excess, 0.0))))
     return sizes
 
