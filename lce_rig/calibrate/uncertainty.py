@@ -54,8 +54,10 @@ def by_scatter(
     sensitivities: tuple[Sensitivity, ...] = ()
     if settings.tolerances is not None:
         sensitivities = _sensitivities(
+            start.fitted,
+            board,
             settings.tolerances,
-            pose_errors(start.fitted, board, settings.lens),
+            settings.lens,
             partial(_moves_by_poses, start),
             {"plate_size": of_scans.plate[:, :6], "board_bow": of_scans.bow[:, :6]},
         )
@@ -67,42 +69,6 @@ def by_scatter(
         laser_angles=laser_angles(joint),
         lens=settings.lens,
     )
-
-
-class PoseErrors(NamedTuple):
-    """Independent errors of lens or pattern, and what they do to the boards' poses in the images.
-
-    Attributes:
-        source: what is wrong.
-        moves: (n, F, 6) tangents by which T_cam_board of each capture moves per unit of each error.
-        turns: (n, 3) rotations of the camera that project like it, as the intrinsics have the same error.
-    """
-
-    source: Source
-    moves: Array
-    turns: Array
-
-
-def pose_errors(
-    observations: Sequence[Observation], board: Board, lens: SessionLens | None
-) -> list[PoseErrors]:
-    """List errors of lens and pattern with their effects on the poses in the images.
-
-    Args:
-        observations: F captures.
-        board: as the profile says.
-        lens: of the session; None leaves its errors out.
-    """
-    poses = np.array([observation.image.T_cam_board for observation in observations])
-    R, t = poses[:, :3, :3], poses[:, :3, 3]
-    # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
-    farther, beside = t + R @ [*board.pattern_offset_m, 0.0], -np.moveaxis(R[:, :, :2], 2, 0)
-    errors = [] if lens is None else [PoseErrors("intrinsics", lens.moves(observations), lens.turns)]
-    of_pattern: dict[Source, Array] = {"square_size": farther[None], "pattern_offset": beside}
-    for source, shifts in of_pattern.items():
-        moves = np.concatenate([shifts, np.zeros_like(shifts)], axis=2)
-        errors.append(PoseErrors(source, moves, np.zeros((len(moves), 3))))
-    return errors
 
 
 class ScanMoves(NamedTuple):
@@ -182,27 +148,38 @@ def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
 
 
 def _sensitivities(
+    observations: Sequence[Observation],
+    board: Board,
     known: Tolerances,
-    of_images: Sequence[PoseErrors],
+    lens: SessionLens | None,
     moves_by_poses: Callable[[Array], Array],
     of_scans: Mapping[Source, Array],
 ) -> tuple[Sensitivity, ...]:
     """Collect the moves of a method's result by errors of lens and board.
 
-    The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
-
     Args:
+        observations: F captures.
+        board: as the profile says.
         known: standard deviations of the errors.
-        of_images: errors of the poses in the images.
-        moves_by_poses: the moves (n, 6) of the result by such errors (n, F, 6).
+        lens: of the session; None leaves its errors out.
+        moves_by_poses: the moves (n, 6) of the result where T_cam_board of each capture moves by tangents
+            (n, F, 6).
         of_scans: by source the moves (n, 6) of the result by other errors.
     """
-    used = {
-        each.source: moves_by_poses(each.moves) + np.pad(each.turns, ((0, 0), (3, 0))) for each in of_images
-    }
-    return tuple(
-        Sensitivity(source, known.sigma(source), moves) for source, moves in {**used, **of_scans}.items()
-    )
+    poses = np.array([observation.image.T_cam_board for observation in observations])
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    moves: dict[Source, Array] = {}
+    if lens is not None:
+        # The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
+        turns = np.pad(lens.turns, ((0, 0), (3, 0)))
+        moves["intrinsics"] = moves_by_poses(lens.moves(observations)) + turns
+    # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
+    farther, beside = t + R @ [*board.pattern_offset_m, 0.0], -np.moveaxis(R[:, :, :2], 2, 0)
+    of_pattern: dict[Source, Array] = {"square_size": farther[None], "pattern_offset": beside}
+    for source, shifts in of_pattern.items():
+        moves[source] = moves_by_poses(np.concatenate([shifts, np.zeros_like(shifts)], axis=2))
+    moves |= of_scans
+    return tuple(Sensitivity(source, known.sigma(source), each) for source, each in moves.items())
 
 
 def systematic_covariances(
@@ -255,8 +232,10 @@ def with_profile(
     if settings.tolerances is None:
         return estimate
     sensitivities = _sensitivities(
+        list(estimate.observations.values()),
+        board,
         settings.tolerances,
-        pose_errors(list(estimate.observations.values()), board, settings.lens),
+        settings.lens,
         partial(_moves_of_joint, joint),
         {"plate_size": _moves_by_plate(joint, estimate, board)},
     )

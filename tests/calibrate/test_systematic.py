@@ -38,7 +38,7 @@ def linearised(captures):
     problem = Problem(features, Weights(3e4, 2e5))
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
     cost = problem.quadratics(solution.x[0], solution.edge_ids[0])
-    start = replace(solve(captures, BOARD), fitted=captures, problem=problem, solution=solution, cost=cost)
+    start = replace(solve(captures, BOARD), fitted=captures, problem=problem, cost=cost)
     return solution.T[0], solution.linear[0, 3], moves_by_scans(start, BOARD).lasers.T
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.background import estimate_shifts, move_ends
 from lce_rig.calibrate.algorithm_1.certificate import solve_globally
-from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions, Weights
+from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import (
     eliminate_linear,
     linear_unknowns,
@@ -59,13 +59,11 @@ class Algorithm1(Start):
     Attributes:
         fitted: the observations as used in the cost: ring ends are moved by the background's shift.
         problem: the moments of the captures used.
-        solution: of all of them.
         cost: about the solution, in tangent (translation m, rotation rad) and edge shift m.
     """
 
     fitted: Sequence[Observation]
     problem: Problem
-    solution: Solutions
     cost: Quadratics
 
 
@@ -115,7 +113,6 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
         diagnostics=figures,
         fitted=fitted,
         problem=problem,
-        solution=solution,
         cost=problem.quadratics(solution.x[0], solution.edge_ids[0], group_placements(fitted)),
     )
 
