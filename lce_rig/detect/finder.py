@@ -159,7 +159,9 @@ class BoardFinder:
         if isinstance(found, Refusal):
             return Search(found, found)
         boards = [replace(board, stamp_ns=scan.stamp_ns) for board in found]
-        return Search(boards, gate_lidar_boards(boards, self.board, self.rig.quality))
+        problems = [_lidar_problem(board, self.board, self.rig.quality) for board in boards]
+        kept = [board for board, problem in zip(boards, problems, strict=True) if problem is None]
+        return Search(boards, kept or problems[0] or [])
 
 
 def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
@@ -181,21 +183,6 @@ def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoar
         figures = {"tilt_deg": sighting.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
         return IMAGE_TILTED.refusal(**figures)
     return _gate_distance("image", sighting.distance_m, limits) or sighting
-
-
-def gate_lidar_boards(
-    candidates: Sequence[LidarBoard], board: Board, limits: QualitySettings
-) -> list[LidarBoard] | Refusal:
-    """Keep the candidates within the profile's limits; refuse with the likeliest one's cause where none is.
-
-    Args:
-        candidates: boards of the scan, likeliest first, at least one.
-        board: the size wanted.
-        limits: `quality` of the rig profile.
-    """
-    refusals = [_lidar_problem(candidate, board, limits) for candidate in candidates]
-    kept = [candidate for candidate, refusal in zip(candidates, refusals, strict=True) if refusal is None]
-    return kept or refusals[0] or []
 
 
 def _lidar_problem(candidate: LidarBoard, board: Board, limits: QualitySettings) -> Refusal | None:
@@ -224,10 +211,11 @@ def _gate_distance(
 ) -> Refusal | None:
     """Refuse a board that is too near or too far."""
     low_m, high_m = limits.min_distance_m, limits.max_distance_m
+    near, far = TOO_NEAR_OR_FAR[stage]
     if distance_m < low_m:
-        figures = {"distance_m": distance_m, "min_distance_m": low_m, "move_m": low_m - distance_m + 0.05}
-        return TOO_NEAR_OR_FAR[stage][0].refusal(**figures)
+        move_m = low_m - distance_m + 0.05
+        return near.refusal(distance_m=distance_m, min_distance_m=low_m, move_m=move_m)
     if distance_m > high_m:
-        figures = {"distance_m": distance_m, "max_distance_m": high_m, "move_m": distance_m - high_m + 0.05}
-        return TOO_NEAR_OR_FAR[stage][1].refusal(**figures)
+        move_m = distance_m - high_m + 0.05
+        return far.refusal(distance_m=distance_m, max_distance_m=high_m, move_m=move_m)
     return None

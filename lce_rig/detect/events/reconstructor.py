@@ -20,7 +20,6 @@ from lce_rig.detect.events.windows import (
     active_share,
     normalise_voxels,
     voxel_grid,
-    window_rule,
 )
 from lce_rig.detect.findings import (
     READ_NETWORK_SETTLING,
@@ -270,7 +269,7 @@ class Reconstructor:
     def _rule(self) -> WindowRule:
         assert self._current is not None
         events = self._current.events
-        return window_rule(events.height_px, events.width_px, self._share)
+        return WindowRule.of(events.height_px * events.width_px, self._share)
 
     def _advance(self, until_ns: int) -> None:
         """Take every step whose window is complete by then."""

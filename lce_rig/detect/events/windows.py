@@ -23,6 +23,12 @@ class WindowRule(NamedTuple):
 
     n_events: int
 
+    @classmethod
+    def of(cls, n_pixels: int, share: float) -> "WindowRule":
+        """Settle the next window's end from the share of a sensor's pixels that is active."""
+        relative = min(1.0, max(share, _MIN_ACTIVE_SHARE) / _USUAL_ACTIVE_SHARE)
+        return cls(max(1, round(_EVENTS_PER_PIXEL * n_pixels * relative)))
+
     def fill(self, n_events: int, age_ns: int) -> float:
         """Return how full a window is, 1 where it ends."""
         return max(min(n_events / self.n_events, age_ns / _SHORTEST_NS), age_ns / _LONGEST_NS)
@@ -40,13 +46,6 @@ class WindowRule(NamedTuple):
             if int(events.t_ns[-1]) >= filled:
                 ends.append(filled)
         return min(ends, default=None)
-
-
-def window_rule(height_px: int, width_px: int, share: float) -> WindowRule:
-    """Settle the next window's end from the share of the sensor that is active."""
-    usual = _EVENTS_PER_PIXEL * height_px * width_px
-    relative = min(1.0, max(share, _MIN_ACTIVE_SHARE) / _USUAL_ACTIVE_SHARE)
-    return WindowRule(max(1, round(usual * relative)))
 
 
 def active_share(events: Events) -> float:

@@ -185,8 +185,7 @@ def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
             best, most = (name, n_seen) if n_seen > most else (best, most)
     if not best:
         return None
-    figures: dict[str, Figure] = {"dictionary": board.dictionary, "seen_dictionary": best, "n_seen": most}
-    return IMAGE_OTHER_DICTIONARY.refusal(**figures)
+    return IMAGE_OTHER_DICTIONARY.refusal(dictionary=board.dictionary, seen_dictionary=best, n_seen=most)
 
 
 def _family(dictionary: str) -> str:

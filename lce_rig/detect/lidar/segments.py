@@ -244,9 +244,6 @@ def _worst_from_chord(xyz: Floats, start: Indices, end: Indices) -> tuple[Indice
 
 def _describe(xyz: Floats, ring: NDArray[np.int16], start: Indices, end: Indices) -> Segments:
     """Sum up the returns (3, N) of each run."""
-    if len(start) == 0:
-        none, no_vector = np.zeros(0), np.zeros((0, 3))
-        return Segments(start, end, ring[:0], none, no_vector, np.zeros((0, 3, 3)), no_vector, none, none)
     begins, run, member = _unroll(start, end)
     count = (end - start).astype(np.float64)
     points = xyz.take(member, axis=1)
