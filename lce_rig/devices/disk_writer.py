@@ -1,26 +1,27 @@
-"""One thread that writes everything of a live collection to disk: captures first, then recordings."""
+"""A thread that writes what a live collection puts, so that nothing waits for a slow disk."""
 
 import threading
-from collections import deque
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 
-#: What may wait for the disk, captures apart.
+#: What may wait for the disk.
 MOST_WAITING_BYTES = 512 * 2**20
 
 T = TypeVar("T")
 
 
-class Sink(Generic[T]):
-    """A session, a recording or a file that a `DiskWriter` writes to.
+class DiskWriter(Generic[T]):
+    """Writes items to a session or a recording, in the order in which they come.
+
+    Open while its `with` block lasts; what waits when it ends is written first. After a failure nothing more
+    is written.
 
     Attributes:
         path: where.
@@ -31,16 +32,56 @@ class Sink(Generic[T]):
     """
 
     def __init__(
-        self, writer: "DiskWriter", path: Path, write: Callable[[T], object], finish: Callable[[], None]
+        self,
+        path: Path,
+        write: Callable[[T], object],
+        finish: Callable[[], None] = lambda: None,
+        most_waiting_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
-        self.path, self.write, self.finish = path, write, finish
+        """Start the thread.
+
+        Args:
+            path: where it writes, for messages.
+            write: writes an item; called in the thread.
+            finish: called in the thread after the last item.
+            most_waiting_bytes: what exceeds them is dropped.
+        """
+        self.path = path
         self.n_written = self.n_dropped = self.n_waiting = 0
         self.failure: LceRigError | None = None
-        self._writer = writer
+        self._write, self._finish, self._most_waiting_bytes = write, finish, most_waiting_bytes
+        self._n_waiting_bytes = 0
+        self._is_closed = False
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, "write to disk")
+
+    def __enter__(self) -> "DiskWriter[T]":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write what waits, and finish; does nothing more the second time."""
+        with self._lock:
+            if not self._is_closed:
+                self._is_closed = True
+                self._thread.submit(self._try, self._finish)
+        self._thread.shutdown()
 
     def put(self, item: T, n_bytes: int = 0) -> None:
-        """Have an item written; never blocks. Where too much waits it is dropped, but for vital sinks."""
-        self._writer.put(self, item, n_bytes)
+        """Have an item written; never blocks. Where too much waits it is dropped."""
+        with self._lock:
+            if self.failure is not None or self._is_closed:
+                return
+            if self._n_waiting_bytes + n_bytes > self._most_waiting_bytes:
+                self.n_dropped += 1
+                return
+            self._n_waiting_bytes += n_bytes
+            self.n_waiting += 1
+            self._thread.submit(self._take, item, n_bytes)
 
     def findings(self) -> list[Finding]:
         """List the gaps in the written data and their causes."""
@@ -51,111 +92,20 @@ class Sink(Generic[T]):
             missing.append(findings.RECORDING_STOPPED(path=path, cause=self.failure.what))
         return missing
 
+    def _take(self, item: T, n_bytes: int) -> None:
+        if self.failure is None and self._try(lambda: self._write(item)):
+            self.n_written += 1
+        with self._lock:
+            self._n_waiting_bytes -= n_bytes
+            self.n_waiting -= 1
 
-class DiskWriter:
-    """Writes items of several sinks in the order in which they come, those of vital ones before all others.
-
-    Open while its `with` block lasts; what waits when it ends is written first. A sink that fails takes
-    nothing more, and the others go on.
-    """
-
-    def __init__(self, most_waiting_bytes: int = MOST_WAITING_BYTES) -> None:
-        self._most_waiting_bytes = most_waiting_bytes
-        self._n_waiting_bytes = 0
-        self._sinks: list[Sink[Any]] = []
-        self._vital_sinks: list[Sink[Any]] = []
-        self._vital: deque[tuple[Sink[Any], Any, int]] = deque()
-        self._others: deque[tuple[Sink[Any], Any, int]] = deque()
-        self._changed = threading.Condition()
-        self._is_closing = False
-        self._thread = threading.Thread(target=self._run, name="write to disk", daemon=True)
-
-    def add(
-        self,
-        path: Path,
-        write: Callable[[T], object],
-        finish: Callable[[], None] = lambda: None,
-        *,
-        is_vital: bool = False,
-    ) -> Sink[T]:
-        """Add a sink.
-
-        Args:
-            path: where it writes, for messages.
-            write: writes an item; called in the writer's thread.
-            finish: called in that thread after the last item.
-            is_vital: its items go first and are never dropped, and its failure is an error.
-        """
-        sink = Sink(self, path, write, finish)
-        self._sinks.append(sink)
-        if is_vital:
-            self._vital_sinks.append(sink)
-        return sink
-
-    def __enter__(self) -> "DiskWriter":
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close, and raise nothing over another error."""
-        with nullcontext() if error is None else suppress(LceRigError):
-            self.close()
-
-    def close(self) -> None:
-        """Write what waits, and finish every sink; does nothing more the second time.
-
-        Raises:
-            LceRigError: a vital sink failed.
-        """
-        with self._changed:
-            self._is_closing = True
-            self._changed.notify()
-        self._thread.join()
-        for sink in self._vital_sinks:
-            if sink.failure is not None:
-                raise sink.failure
-
-    def put(self, sink: Sink[T], item: T, n_bytes: int) -> None:
-        """Queue an item; see `Sink.put`."""
-        is_vital = sink in self._vital_sinks
-        with self._changed:
-            if sink.failure is not None or (self._is_closing and not is_vital):
-                return
-            if is_vital:
-                n_bytes = 0
-            elif self._n_waiting_bytes + n_bytes > self._most_waiting_bytes:
-                sink.n_dropped += 1
-                return
-            (self._vital if is_vital else self._others).append((sink, item, n_bytes))
-            self._n_waiting_bytes += n_bytes
-            sink.n_waiting += 1
-            self._changed.notify()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._vital or self._others or self._is_closing)
-                queue = self._vital or self._others
-                if not queue:
-                    break
-                sink, item, n_bytes = queue.popleft()
-                self._n_waiting_bytes -= n_bytes
-            if sink.failure is None and self._try(sink, partial(sink.write, item)):
-                sink.n_written += 1
-            with self._changed:
-                sink.n_waiting -= 1
-        for sink in self._sinks:
-            self._try(sink, sink.finish)
-
-    def _try(self, sink: Sink[Any], act: Callable[[], object]) -> bool:
+    def _try(self, act: Callable[[], object]) -> bool:
         try:
             act()
         except LceRigError as error:
-            sink.failure = sink.failure or error
-        except Exception as error:  # Nothing that goes wrong with one sink may end the thread.
+            self.failure = self.failure or error
+        except Exception as error:  # Nothing that goes wrong may end the thread.
             cause = getattr(error, "strerror", None) or repr(error)
-            what, hint = f"{sink.path} cannot be written: {cause}", "Free space there, or use another disk."
-            sink.failure = sink.failure or SessionError(what, hint)
-        return sink.failure is None
+            what, hint = f"{self.path} cannot be written: {cause}", "Free space there, or use another disk."
+            self.failure = self.failure or SessionError(what, hint)
+        return self.failure is None

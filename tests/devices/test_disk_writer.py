@@ -1,78 +1,64 @@
-"""One thread writes captures and recordings: what is vital first, and nothing waits for a slow disk."""
+"""A thread writes captures, another a recording: nothing waits for a slow disk."""
 
 import threading
 from pathlib import Path
 
 import pytest
 
-from lce_rig.core.errors import SessionError
+from lce_rig.collect.live.capture_writer import CaptureWriter
+from lce_rig.core.errors import LceRigError
 from lce_rig.devices.disk_writer import DiskWriter
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
 
 HERE = Path("somewhere")
 
 
-def test_vital_items_overtake_others_and_each_sink_keeps_its_order():
-    written = []
-    may_go = threading.Event()
+def test_items_are_written_in_order_while_nothing_waits_for_them():
+    written, may_go = [], threading.Event()
 
     def write(item):
         may_go.wait(10)
         written.append(item)
 
-    with DiskWriter() as disk:
-        captures, samples = disk.add(HERE, write, is_vital=True), disk.add(HERE, write)
+    with DiskWriter(HERE, write, lambda: written.append("finished")) as disk:
         for item in ("a", "b", "c"):
-            samples.put(item, 1)
-        captures.put("first")
-        captures.put("second")
-        assert captures.n_waiting == 2 and samples.n_waiting
+            disk.put(item)
+        assert disk.n_waiting == 3
         may_go.set()
-    assert [item for item in written if item not in "abc"] == ["first", "second"]
-    assert [item for item in written if item in "abc"] == ["a", "b", "c"]
-    assert written.index("second") <= 2, "one sample at most was being written already"
-    assert captures.n_waiting == 0 and (captures.n_written, samples.n_written) == (2, 3)
+        disk.close()
+        assert written == ["a", "b", "c", "finished"]
+    assert written == ["a", "b", "c", "finished"]
+    assert (disk.n_waiting, disk.n_written) == (0, 3)
 
 
 def test_what_a_slow_disk_cannot_take_is_dropped_counted_and_said(tmp_path):
     path = tmp_path / "raw"
-    with path.open("wb") as file, DiskWriter(most_waiting_bytes=100_000) as disk:
-        sink = disk.add(path, file.write)
+    with path.open("wb") as file, DiskWriter(path, file.write, most_waiting_bytes=100_000) as disk:
         for _ in range(40_000):
-            sink.put(bytes(1206), 1206)
-    assert sink.n_written + sink.n_dropped == 40_000 and sink.n_dropped > 0
-    assert path.stat().st_size == sink.n_written * 1206
-    (finding,) = sink.findings()
-    assert (finding.code, finding.figures["n"]) == ("device.recording_incomplete", sink.n_dropped)
+            disk.put(bytes(1206), 1206)
+    assert disk.n_written + disk.n_dropped == 40_000 and disk.n_dropped > 0
+    assert path.stat().st_size == disk.n_written * 1206
+    (finding,) = disk.findings()
+    assert (finding.code, finding.figures["n"]) == ("device.recording_incomplete", disk.n_dropped)
 
 
-def test_a_sink_that_fails_takes_nothing_more_and_the_others_go_on():
+def test_a_writer_that_fails_takes_nothing_more():
     def fail(_item):
         raise OSError(28, "No space left on device")
 
-    with DiskWriter() as disk:
-        full, other = disk.add(HERE, fail), disk.add(HERE, lambda _item: None)
+    with DiskWriter(HERE, fail) as disk:
         for k in range(5):
-            full.put(k)
-            other.put(k)
-    assert (full.n_written, other.n_written) == (0, 5)
-    assert [finding.code for finding in full.findings()] == ["device.recording_stopped"]
+            disk.put(k)
+    assert (disk.n_written, disk.n_waiting) == (0, 0)
+    assert [finding.code for finding in disk.findings()] == ["device.recording_stopped"]
 
 
-def test_a_vital_sink_that_fails_is_an_error_but_not_over_another():
-    def fail(_item):
-        raise SessionError("the disk is gone")
-
-    with pytest.raises(SessionError, match="gone"), DiskWriter() as disk:
-        disk.add(HERE, fail, is_vital=True).put(1)
-    with pytest.raises(KeyError), DiskWriter() as disk:
-        disk.add(HERE, fail, is_vital=True).put(1)
-        raise KeyError
-
-
-def test_sinks_are_finished_after_their_last_item():
-    done = []
-    with DiskWriter() as disk:
-        disk.add(HERE, done.append, lambda: done.append("finished")).put("item")
-        disk.close()
-        assert done == ["item", "finished"]
-    assert done == ["item", "finished"]
+def test_captures_that_cannot_be_written_are_an_error_but_not_over_another(tmp_path):
+    with Session.create(tmp_path / "session", load_rig("rlfs")) as session:
+        keeper = CaptureWriter(session)
+        with pytest.raises(KeyError), keeper.disk:
+            keeper.take_back("000001")  # there is none
+            raise KeyError
+        with pytest.raises(LceRigError, match="000001"):
+            keeper.close()

@@ -18,7 +18,7 @@ from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import Observation
-from lce_rig.devices.disk_writer import DiskWriter, Sink
+from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -121,19 +121,30 @@ class CaptureWriter:
 
     Attributes:
         session: open for writing.
+        disk: its thread; open while its `with` block lasts.
     """
 
-    def __init__(self, session: Session, disk: DiskWriter) -> None:
+    def __init__(self, session: Session) -> None:
         """Prepare; see `CaptureWriter`."""
         self.session = session
         self._done: deque[tuple[str, BoardDetection | None, float]] = deque()
         # Captures are stored and rejected in the order of the requests.
-        self._sink: Sink[Callable[[], None]] = disk.add(session.path, lambda step: step(), is_vital=True)
+        self.disk: DiskWriter[Callable[[], None]] = DiskWriter(session.path, lambda step: step())
+
+    def close(self) -> None:
+        """Write what was asked for.
+
+        Raises:
+            SessionError: a capture cannot be written.
+        """
+        self.disk.close()
+        if self.disk.failure is not None:
+            raise self.disk.failure
 
     @property
     def is_busy(self) -> bool:
         """Whether a capture is not on the disk, or not taken back, yet."""
-        return self._sink.n_waiting > 0
+        return self.disk.n_waiting > 0
 
     def keep(self, moment: CaptureMoment, events: Sequence[EventCut], meta: Mapping[str, object]) -> None:
         """Have a capture written; returns at once.
@@ -152,7 +163,7 @@ class CaptureWriter:
             name = self.session.add_capture(frame.images, frame.scans, whole, cuts)
             self._done.append((name, moment.detection, time.monotonic() - asked_s))
 
-        self._sink.put(store)
+        self.disk.put(store)
 
     def take_back(self, name: str) -> None:
         """Reject a capture, which may still wait to be written; returns at once."""
@@ -161,7 +172,7 @@ class CaptureWriter:
             self.session.reject(name, "taken back while collecting")
             self._done.append((name, None, 0.0))
 
-        self._sink.put(reject)
+        self.disk.put(reject)
 
     def take(self) -> list[tuple[str, BoardDetection | None, float]]:
         """Return the captures saved or taken back since the last call, by name.
@@ -171,32 +182,31 @@ class CaptureWriter:
         Raises:
             SessionError: one cannot be written: the disk is full, or gone.
         """
-        failure = self._sink.failure
+        failure = self.disk.failure
         done = [self._done.popleft() for _ in range(len(self._done))]
         if failure is not None and not done:
             raise failure
         return done
 
 
-def record_streams(folder: Path, rig: Rig, disk: DiskWriter) -> tuple[Callable[[Sample], None], Sink[Sample]]:
+def record_streams(folder: Path, rig: Rig) -> tuple[Callable[[Sample], None], DiskWriter[Sample]]:
     """Record the samples of all sensors as a bag in a new folder.
 
     Args:
         folder: does not exist yet.
         rig: the profile.
-        disk: writes.
 
     Returns:
-        A function that takes each sample without blocking; and the sink of samples.
+        A function that takes each sample without blocking; and the writer of samples.
 
     Raises:
         SourceError: the folder exists already, or cannot be made.
     """
     recorder = BagRecorder.in_folder(folder, rig)
-    sink: Sink[Sample] = disk.add(folder, recorder.write, recorder.close)
+    disk: DiskWriter[Sample] = DiskWriter(folder, recorder.write, recorder.close)
 
     def record(sample: Sample) -> None:
         arrays = [value for value in vars(sample).values() if isinstance(value, np.ndarray)]
-        sink.put(sample, sum(array.nbytes for array in arrays))
+        disk.put(sample, sum(array.nbytes for array in arrays))
 
-    return record, sink
+    return record, disk

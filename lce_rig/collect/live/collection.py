@@ -32,7 +32,6 @@ from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, Liv
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.geometry import Array
 from lce_rig.devices import edge_cameras
-from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.session import Session
@@ -77,20 +76,22 @@ def collect_live(
     for capture in session.captures:
         count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, then what was decided is written.
-    with DiskWriter() as disk, ExitStack() as stack:
+    with ExitStack() as stack:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_TURN_S)
         record, recorded = None, None
         if record_to is not None:
-            record, recorded = record_streams(record_to, rig, disk)
+            record, recorded = record_streams(record_to, rig)
+            stack.enter_context(recorded)
+        keeper = CaptureWriter(session)
+        stack.enter_context(keeper.disk)
         search = BoardSearch(rig)
         with search, Learning(rig, guides) as learning:
-            keeper = CaptureWriter(session, disk)
             clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
             with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, board, record) as feed:
                 loop = _Loop(options, guides, feed, search, keeper, learning)
                 loop.run(show, keys)
-            disk.close()
+            keeper.close()
             loop.take_kept()
             report = loop.close_books()
     if recorded is not None:
