@@ -16,7 +16,7 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.rig.profile import PPS_LINE
-from lce_rig.timing.clock import NS_PER_S, ClockModel
+from lce_rig.timing.clock import NS_PER_S
 from lce_rig.timing.clock_fit import ClockTracker
 
 VERSION = 1
@@ -206,7 +206,8 @@ class BoardState:
         hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: of the last time request.
-        host_tracker, utc_tracker: followers of the computer's time of day and of UTC on the board's clock.
+        host_tracker, utc_tracker: of the computer's time of day and of UTC on the board's clock, by time
+            requests and by pulses per second; without a model before it is known.
     """
 
     def __init__(self, lines: Mapping[int, str]) -> None:
@@ -288,20 +289,10 @@ class BoardState:
         """Whether no time request is under way."""
         return self._asked is None
 
-    @property
-    def host_clock(self) -> ClockModel | None:
-        """The computer's time of day on the board's clock, by time requests; None before it is known."""
-        return self.host_tracker.model
-
-    @property
-    def utc_clock(self) -> ClockModel | None:
-        """UTC on the board's clock, by the pulses per second; None where it does not know UTC."""
-        return self.utc_tracker.model
-
     def clock_state(self) -> Finding:
         """Report the clock of the timestamps and its synchronisation with others."""
         figures: dict[str, Any] = {}
-        for name, model in (("host", self.host_clock), ("utc", self.utc_clock)):
+        for name, model in (("host", self.host_tracker.model), ("utc", self.utc_tracker.model)):
             if model is not None:
                 figures |= {
                     f"{name}_by": model.origin,
@@ -334,7 +325,7 @@ class BoardState:
         if self.n_lost_by_line:
             by_line = ", ".join(f"{line} {n}" for line, n in sorted(self.n_lost_by_line.items()))
             problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
-        if self.host_clock is None and has_waited:
+        if self.host_tracker.model is None and has_waited:
             problems.append(findings.BOARD_NOT_TIED())
         steps = self.host_tracker.steps
         if steps:

@@ -154,13 +154,13 @@ class SyncBoard(LiveSource):
     def host_clock(self) -> ClockModel | None:
         """The computer's time of day on the board's clock; None before it is known."""
         with self._lock:
-            return self._state.host_clock
+            return self._state.host_tracker.model
 
     @property
     def utc_clock(self) -> ClockModel | None:
         """UTC on the board's clock, which is the LiDAR's; None where the board does not know UTC."""
         with self._lock:
-            return self._state.utc_clock
+            return self._state.utc_tracker.model
 
     def start_triggers(self, rate_hz: float | None = None) -> None:
         """Let the pulses of the cameras begin; running numbers go on.

@@ -77,7 +77,7 @@ def test_answers_to_other_questions_and_of_last_week_are_left_out():
     state.take(TimeReply(2, 100_000_000, 100_000_010), arrival(0.001))
     assert not state.has_answered
     state.take(TimeReply(3, 100_000_000, 100_000_010), arrival(0.001, set_by_s=-3600))
-    assert state.has_answered and state.host_clock is None
+    assert state.has_answered and state.host_tracker.model is None
 
 
 def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
@@ -86,7 +86,7 @@ def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
         ask(state, 0.1 * k, set_by_s=3.0 * (k >= 100), cookie=k)
     assert state.n_restarts == 0
     assert [round(step.size_ns / S) for step in state.host_tracker.steps] == [3]
-    assert abs(state.host_clock.convert(115 * S) - DAY_NS - 18 * S) < 5000
+    assert abs(state.host_tracker.model.convert(115 * S) - DAY_NS - 18 * S) < 5000
     (jumped,) = [found for found in problems(state) if found.code == "clock.computer_jumped"]
     assert (jumped.figures["n"], jumped.figure("last_s")) == (1, pytest.approx(3, abs=1e-3))
 
@@ -98,8 +98,8 @@ def test_utc_comes_from_pulses_that_know_their_second():
         edge = PpsEdge(k, 100_000_000 + 1_000_040 * k, 1_753_000_000 + k, "G")
         found += state.take(edge, arrival(k + 0.001))
     assert [pulse.sensor for pulse in found] == ["pps"] * 10
-    assert state.utc_clock.drift == pytest.approx(-40e-6, abs=0.1e-6)
-    assert abs(state.utc_clock.convert(100 * S) - DAY_NS) < 1000
+    assert state.utc_tracker.model.drift == pytest.approx(-40e-6, abs=0.1e-6)
+    assert abs(state.utc_tracker.model.convert(100 * S) - DAY_NS) < 1000
     told = state.clock_state()
     assert told.code == "clock.board" and told.figure("utc_drift_ppm") == pytest.approx(-40, abs=0.1)
 
