@@ -92,6 +92,8 @@ def calibrate_together(
             lens=own.lens,
             estimated_with=tuple(other for other in names if other != name),
             same_scan=own.same_scan,
+            channels=own.channels,
+            channel_difference=own.channel_difference,
         )
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ joint.cov_z @ J.T) * scale

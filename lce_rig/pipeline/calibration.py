@@ -350,20 +350,11 @@ def _solve_together(
             {alone[k].camera: alone[k].settings for k in members},
         )
         for k in members:
-            solved[k] = _part_of(together, rig, detections, alone[k])
+            own = alone[k]
+            estimate = together.estimates[own.camera]
+            validation = _examine(rig, detections, own.pairs, estimate)
+            solved[k] = replace(own, estimate=estimate, validation=validation, together=together)
     return solved
-
-
-def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
-    """Replace a camera's own estimate by its part of a joint one."""
-    estimate = together.estimates[alone.camera]
-    estimate = replace(
-        estimate,
-        channels=alone.estimate.channels,
-        channel_difference=alone.estimate.channel_difference,
-    )
-    validation = _examine(rig, detections, alone.pairs, estimate)
-    return replace(alone, estimate=estimate, validation=validation, together=together)
 
 
 def _judged(
