@@ -264,13 +264,3 @@ TOO_NEAR_OR_FAR: dict[Stage, tuple[Kind, Kind]] = {
     "image": _distance_kinds("image", "camera"),
     "lidar": _distance_kinds("lidar", "LiDAR"),
 }
-IMAGE_SIZE_OTHER = Kind(
-    "image.size_other",
-    "{width_px}x{height_px} px cannot be used, the profile's intrinsics belong to "
-    "{wanted_width_px}x{wanted_height_px} px",
-    "use the intrinsics of this mode, or record in the mode of the intrinsics",
-    actions={
-        "scaled": "multiply fx, fy, cx, cy by {factor:.4g} if the image is only scaled",
-        "swapped": "set resolution_px: [{width_px}, {height_px}], and check fx, fy, cx, cy",
-    },
-)

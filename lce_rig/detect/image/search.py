@@ -18,7 +18,6 @@ from lce_rig.detect.findings import (
     IMAGE_MISFIT,
     IMAGE_NO_POSE,
     IMAGE_NOT_AT_FIRST_SIGHT,
-    IMAGE_SIZE_OTHER,
 )
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.markers import find_marked_grid, keep_marked, marked_patches
@@ -159,18 +158,16 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
         outside = np.concatenate(beyond)
         if len(outside) and np.percentile(outside, 99) <= max(0.3 * inside, 2.0):
             return grey
-    is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
-    is_swapped = (width, height) == (wanted_height, wanted_width)
-    other_size = IMAGE_SIZE_OTHER(
-        f"{image.sensor}.{image.channel}",
-        action="scaled" if is_scaled else "swapped" if is_swapped else "",
-        width_px=width,
-        height_px=height,
-        wanted_width_px=wanted_width,
-        wanted_height_px=wanted_height,
-        factor=width / wanted_width,
+    hint = "Use the intrinsics of this mode, or record in the mode of the intrinsics."
+    if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
+        hint = f"Multiply fx, fy, cx, cy by {width / wanted_width:.4g} if the image is only scaled."
+    elif (width, height) == (wanted_height, wanted_width):
+        hint = f"Set resolution_px: [{width}, {height}], and check fx, fy, cx, cy."
+    raise ProfileError(
+        f"{image.sensor}.{image.channel}: {width}x{height} px cannot be used, "
+        f"the profile's intrinsics belong to {wanted_width}x{wanted_height} px",
+        hint,
     )
-    raise ProfileError(f"{other_size.subject}: {other_size.text}", other_size.advice)
 
 
 def _follow(

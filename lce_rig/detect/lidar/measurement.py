@@ -121,7 +121,8 @@ def measure_size(
     axis = over.argmax(axis=1)
     rows = np.arange(len(axis))
     sign = np.where(local[rows, axis] < 0, -1.0, 1.0)
-    step_m = np.abs((ends.gap @ placement.axes.T)[rows, axis])
+    gap_local = placement.local(ends.gap + [placement.u_m, placement.v_m])
+    step_m = np.abs(gap_local[rows, axis])
     half = np.asarray(placement.half_m)
     # Unknowns: shift along x and y, angle, half width, half height.
     jacobian = np.zeros((len(axis), 5))
@@ -149,10 +150,10 @@ def measure_size(
     if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
         # The ends contradict each other and do not determine the size.
         return placement, np.full(2, SIZE_PRIOR_M), target, step_m
-    shift_u_m, shift_v_m = (x[:2] @ placement.axes).tolist()
+    cosine, sine = placement.axes[0]
     fitted = Placement(
-        placement.u_m + shift_u_m,
-        placement.v_m + shift_v_m,
+        placement.u_m + float(cosine * x[0] - sine * x[1]),
+        placement.v_m + float(sine * x[0] + cosine * x[1]),
         placement.angle_rad + float(x[2]),
         (float(half[0] + x[3]), float(half[1] + x[4])),
         placement.error_m,
@@ -211,7 +212,7 @@ def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple
     """
     height_m = points @ start[:3] + start[3]
     scale_m = _MAD * median(np.abs(height_m - median(height_m))) + 0.001
-    scale_m *= distance_m / start[3]
+    scale_m = scale_m * distance_m / start[3]
     range_m = np.linalg.norm(points, axis=1)
     rays = points / range_m[:, None]
     m = -start[:3] / start[3]

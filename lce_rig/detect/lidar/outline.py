@@ -252,13 +252,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             middle = (np.arange(n_strips) + 0.5) * width - length / 2
             at = np.empty((n_strips, 2))
             at[:, axis], at[:, 1 - axis] = sign * (half[axis] + off), middle
-            parts.append(
-                (
-                    (at @ axes + [placement.u_m, placement.v_m])[is_seen],
-                    np.tile(sign * axes[axis], (n_strips, 1))[is_seen],
-                    off[is_seen],
-                    sigma_m[is_seen],
-                )
-            )
-    uv, outwards, off_m, sigma_m = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Strips(uv, outwards, off_m, sigma_m)
+            uv = at @ axes + [placement.u_m, placement.v_m]
+            outwards = np.tile(sign * axes[axis], (n_strips, 1))
+            parts.append([each[is_seen] for each in (uv, outwards, off, sigma_m)])
+    return Strips(*(np.concatenate(part) for part in zip(*parts, strict=True)))

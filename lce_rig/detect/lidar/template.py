@@ -88,7 +88,7 @@ class Placement:
 
     def local(self, uv: Array) -> Array:
         """Take points (..., 2) of the plane view to the rectangle's axes, m."""
-        return np.asarray((uv - [self.u_m, self.v_m]) @ self.axes.T)
+        return np.asarray((uv - [self.u_m, self.v_m]) @ np.ascontiguousarray(self.axes.T))
 
     def distance_m(self, uv: Array) -> Array:
         """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
