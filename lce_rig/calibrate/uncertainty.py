@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,9 +41,10 @@ def by_scatter(
         board: its specification.
         settings: priors and tolerances.
     """
-    scatter, of_scans = start.cost.jackknife_covariance(), moves_by_scans(start, board)
+    scatter = start.cost.jackknife_covariance()
+    by_lasers, by_bow, by_plate = moves_by_scans(start, board)
     lasers, offset = systematic_covariances(
-        of_scans.lasers.T, settings.laser_bias_sigma_m, settings.range_offset_sigma_m
+        by_lasers.T, settings.laser_bias_sigma_m, settings.range_offset_sigma_m
     )
     systematic = lasers + offset
     cov = scatter + systematic
@@ -59,7 +59,7 @@ def by_scatter(
             settings.tolerances,
             settings.lens,
             partial(_moves_by_poses, start),
-            {"plate_size": of_scans.plate[:, :6], "board_bow": of_scans.bow[:, :6]},
+            {"plate_size": by_plate[:, :6], "board_bow": by_bow[:, :6]},
         )
     return replace(
         estimate,
@@ -71,23 +71,7 @@ def by_scatter(
     )
 
 
-class ScanMoves(NamedTuple):
-    """How far constant errors of scans and plate move Algorithm 1's solution.
-
-    Tangents (translation m, rotation rad, edge shift m) per m of the error.
-
-    Attributes:
-        lasers: (L, 7) by the range offset of each ring seen.
-        bow: (2, 7) by the height of the plate's middle over its ends, along its width and its height.
-        plate: (2, 7) by the plate's width and height, as the profile says them.
-    """
-
-    lasers: Array
-    bow: Array
-    plate: Array
-
-
-def moves_by_scans(start: Algorithm1, board: Board) -> ScanMoves:
+def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array]:
     """Differentiate the solution by constant errors of the scans and the plate, by one Newton step.
 
     With half gradient g and half Hessian H of the cost, both at the solution, an error b moves the minimum by
@@ -101,6 +85,11 @@ def moves_by_scans(start: Algorithm1, board: Board) -> ScanMoves:
     Args:
         start: the solution; its association is held.
         board: its specification.
+
+    Returns:
+        Tangents (translation m, rotation rad, edge shift m) per m of an error: (L, 7) by the range offset of
+        each ring seen; (2, 7) by the height of the plate's middle over its ends, along its width and its
+        height; (2, 7) by the plate's width and height, as the profile says them.
     """
     rings = np.unique(np.concatenate([o.lidar.ring for o in start.fitted]))
     T, weights, keep = start.T_cam_lidar, start.problem.weights, start.problem.keep
@@ -126,7 +115,7 @@ def moves_by_scans(start: Algorithm1, board: Board) -> ScanMoves:
         # Of a wider plate, either edge lies half as much farther out.
         changes[L + 2 :] += np.abs(board.edges()[1][edge, :2]).T @ J_end / 2
     moves = -changes @ symmetric_inverse(start.cost.information)
-    return ScanMoves(moves[:L], moves[L : L + 2], moves[L + 2 :])
+    return moves[:L], moves[L : L + 2], moves[L + 2 :]
 
 
 def _one_x_y(T_board_lidar: Array, points: Array) -> Array:

@@ -39,7 +39,7 @@ def linearised(captures):
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
     cost = problem.quadratics(solution.x[0], solution.edge_ids[0])
     start = replace(solve(captures, BOARD), fitted=captures, problem=problem, cost=cost)
-    return solution.T[0], solution.linear[0, 3], moves_by_scans(start, BOARD).lasers.T
+    return solution.T[0], solution.linear[0, 3], moves_by_scans(start, BOARD)[0].T
 
 
 @pytest.mark.parametrize("rings", [[5], [11], list(range(16))])
