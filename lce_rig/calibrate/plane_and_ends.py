@@ -141,11 +141,6 @@ def turn_about_z(vectors: Array, angle_rad: Array) -> Array:
     return np.stack([x, y, vectors[:, 2]], axis=1)
 
 
-def along_normals(normals: Array, anchors: Array, points: Array, T: Array) -> Array:
-    """Evaluate n . (g - R p - t) for normals and anchors (..., N, 3), points (N, 3) and T (..., 4, 4)."""
-    return np.asarray(np.sum((anchors - transform(T, points)) * normals, axis=-1))
-
-
 def differentiate(normals: Array, levers: Array) -> Array:
     """Differentiate n . (g - R p - t) by the tangent of (R, t), translation before rotation.
 
@@ -168,7 +163,8 @@ def plane_residuals(f: CaptureFeatures, T_cam_lidar: Array, points: Array | None
         T_cam_lidar: (..., 4, 4).
         points: other points of the board, frame lidar.
     """
-    return along_normals(f.normal, f.centre, f.plane_points if points is None else points, T_cam_lidar)
+    moved = transform(T_cam_lidar, f.plane_points if points is None else points)
+    return np.asarray((f.centre - moved) @ f.normal)
 
 
 def end_residuals(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, NDArray[np.intp]]:

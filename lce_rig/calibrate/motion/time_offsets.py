@@ -29,13 +29,12 @@ from lce_rig.calibrate.motion.board_motion import (
 from lce_rig.calibrate.observations import Clocks, SharedScan
 from lce_rig.calibrate.plane_and_ends import (
     CaptureFeatures,
-    along_normals,
     differentiate,
     extract_features,
 )
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, difference
+from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import Observation
 
 MIN_MOVING = 6
@@ -238,7 +237,7 @@ def _search_grid(
         offset_s = np.array(ticks_s)
         motions = fit_motions(samples, offset_s)
         T_cam_board = motions.at(times_s)
-        depth = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, T)
+        depth = np.sum((T_cam_board[:, :3, 3] - transform(T, middles)) * T_cam_board[:, :3, 2], axis=1)
         # The extrinsics adapt: what their six small motions explain is no residual.
         J = differentiate(T_cam_board[:, :3, 2], middles @ T[:3, :3].T)
         misfit = np.abs(depth - J @ np.linalg.lstsq(J, depth, rcond=None)[0])
