@@ -11,7 +11,7 @@ Verdict = Literal["pass", "marginal", "fail"]
 _OF_DISTANCES = (
     "verdict.shares_differ "
     "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "
-    "verdict.translation_uncertain verdict.scene verdict.scene_not_used "
+    "verdict.translation_uncertain verdict.scene "
 )
 _OF_POSES = _OF_DISTANCES + (
     "verdict.cameras_differ verdict.channels_differ verdict.planes_apart verdict.sensors_disagree "
@@ -21,8 +21,8 @@ _OF_POSES = _OF_DISTANCES + (
 _UNLIKELY = 0.05
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
-    "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
-    "verdict.moved": _OF_POSES.split(),
+    "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics verdict.laser_angles".split(),
+    "verdict.moved": f"{_OF_POSES}verdict.laser_angles".split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
     "verdict.plate_edge": [
         "verdict.pattern_offset",
@@ -36,7 +36,7 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
         f"{_OF_DISTANCES}verdict.moved verdict.scale verdict.far_from_nominal verdict.cameras_differ "
         "verdict.planes_apart verdict.sensors_disagree verdict.few_used".split()
     ),
-    "verdict.scale": f"{_OF_DISTANCES}verdict.moved verdict.sensors_disagree verdict.planes_apart".split(),
+    "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
     "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.moved verdict.planes_apart".split(),
     "verdict.shares_differ": _OF_SIGMAS,
     "verdict.cameras_differ": _OF_SIGMAS,
@@ -96,15 +96,19 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 def consequences(findings: Sequence[Finding]) -> dict[str, str]:
     """Map the codes of findings that follow from others to the code of their cause.
 
-    A cause that only warns, such as rough intrinsics, does not explain another that fails.
+    A cause that only warns, such as rough intrinsics, does not explain another that fails. Captures that are
+    before or after all others show by their order that a sensor moved: no other cause explains them.
     """
-    codes = dict.fromkeys(finding.code for finding in findings if finding.severity != "note")
+    told = [finding for finding in findings if finding.severity != "note"]
+    codes = dict.fromkeys(finding.code for finding in told)
+    in_order = {each.code for each in told if each.code == "verdict.moved" and each.figures.get("place")}
     fails = {finding.code for finding in findings if finding.severity == "error"}
     causes = sorted((code for code in _FOLLOWS if code in codes), key=lambda code: code not in fails)
     following: dict[str, str] = {}
     for cause in causes:
         outranked = set() if cause in fails else fails & _FOLLOWS.keys()
-        following = dict.fromkeys((codes.keys() & _FOLLOWS[cause]) - outranked, cause) | following
+        explained = (codes.keys() & _FOLLOWS[cause]) - outranked - in_order
+        following = dict.fromkeys(explained, cause) | following
     return following
 
 

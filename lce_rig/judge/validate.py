@@ -46,8 +46,8 @@ from lce_rig.judge.split_consistency import (
 )
 from lce_rig.rig import LidarSettings, Rig
 
-# Fewer placements do not allow leave-one-out.
-_MIN_PLACEMENTS = 4
+MIN_PLACEMENTS = 4
+"""Fewer placements do not allow leave-one-out, and do not tell the lasers' angles."""
 # Captures agree if their scatter about common extrinsics, per degree of freedom, is at most this multiple of
 # that of the captures used; other things rejected scatter a hundred times as far.
 _AGREE = 8.0
@@ -117,7 +117,7 @@ def validate(
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
-    if len(expansion.groups) >= _MIN_PLACEMENTS:
+    if len(expansion.groups) >= MIN_PLACEMENTS:
         if lens is not None:
             scale, pattern = scale_of(expansion), pattern_of(expansion)
             # Neither chance nor the profile's deviation explains an offset that contradicts it.

@@ -45,7 +45,7 @@ from lce_rig.judge.findings import (
 )
 from lce_rig.judge.intrinsics_check import lens_findings
 from lce_rig.judge.split_consistency import split_findings
-from lce_rig.judge.validate import Validation
+from lce_rig.judge.validate import MIN_PLACEMENTS, Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
 # A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.
@@ -86,7 +86,7 @@ def judge(
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: number of captures, including those without a board.
-        others: of other evidence: contradictions between cameras, what the scene did to the result.
+        others: of other evidence: contradictions between cameras.
         T_view: (4, 4) from the frame of the nominal extrinsic to that of the estimate; None for the same.
         n_misfits: images whose corners fit no pose of the board. A wrong lens causes them.
 
@@ -94,12 +94,13 @@ def judge(
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
     board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
-    proof = estimate.certificate
+    proof, n_placements = estimate.certificate, estimate.diagnostics.n_placements
+    are_angles_known = rig.lidars[lidar].has_rings and n_placements >= MIN_PLACEMENTS
     findings = [
         *([] if proof.is_optimal else [NOT_CERTIFIED(gap=proof.gap)]),
         *examination.lens_model,
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
-        *(angle_findings(estimate.laser_angles) if rig.lidars[lidar].has_rings else ()),
+        *(angle_findings(estimate.laser_angles) if are_angles_known else ()),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, board),
         *_pattern(examination.pattern, len(estimate.used)),
@@ -120,7 +121,8 @@ def judge(
 def _blame_lens(findings: Sequence[Finding], is_misfit: bool) -> list[Finding]:
     """Make contradicted intrinsics the cause of boards at two places that differ, unless squares are it.
 
-    Captures that fit another mounting are a note beside intrinsics that fit few images.
+    Captures that fit another mounting are a note beside intrinsics that fit few images, but not those whose
+    images show that cameras moved against each other.
 
     Args:
         findings: against extrinsics.
@@ -130,13 +132,15 @@ def _blame_lens(findings: Sequence[Finding], is_misfit: bool) -> list[Finding]:
     if not blamed:
         return list(findings)
     errors = {f.code for f in findings if f.severity == "error"}
-    of_motion = {MOVED.code} if is_misfit else set()
-    is_cause = bool(errors & of_motion) or (SHARES_DIFFER.code in errors and SCALE_OFF.code not in errors)
+    moved = [f for f in findings if is_misfit and f.code == MOVED.code and not f.subject]
+    is_cause = any(f.severity == "error" for f in moved) or (
+        SHARES_DIFFER.code in errors and SCALE_OFF.code not in errors
+    )
 
     def severity_of(f: Finding) -> Severity:
         if f in blamed and is_cause:
             return "error"
-        return "note" if f.code in of_motion else f.severity
+        return "note" if f in moved else f.severity
 
     return [replace(f, severity=severity_of(f)) for f in findings]
 

@@ -1,6 +1,7 @@
 """The verdict: a sound result passes, and each kind of finding is named with its figure."""
 
 import functools
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,17 +9,20 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Certificate
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import KINDS, Finding, Refusal
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
     INTRINSICS,
+    LASER_ANGLES,
     LAST_REJECTED,
+    MOVED,
     NOT_CERTIFIED,
     PLANE_RESIDUAL,
     SCALE_OFF,
     SHARES_DIFFER,
     by_cause,
+    causes_of,
     consequences,
 )
 from lce_rig.judge.split_consistency import Contrast
@@ -221,6 +225,38 @@ def test_what_follows_from_a_cause_stands_below_it():
     assert consequences(listed) == {"verdict.plane_residual": scale.code, "verdict.shares_differ": scale.code}
 
 
+@pytest.mark.parametrize("place", ["", "last"])
+def test_of_any_two_or_three_reasons_one_is_the_cause(place):
+    verdicts = [code for code in KINDS if code.startswith("verdict.")]
+    for codes in (*itertools.combinations(verdicts, 2), *itertools.combinations(verdicts, 3)):
+        assert causes_of([Finding(code, figures={"place": place}) for code in codes]), codes
+
+
+@pytest.mark.parametrize(
+    ("others", "place", "causes"),
+    [
+        (["scale"], "last", ["moved"]),
+        (["scale"], "", ["moved"]),
+        (["intrinsics"], "first", ["intrinsics", "moved"]),
+        (["intrinsics"], "", ["intrinsics"]),
+        (["pattern_offset"], "last", ["moved", "pattern_offset"]),
+        (["intrinsics", "scale", "laser_angles"], "", ["intrinsics"]),
+        (["laser_angles"], "last", ["moved"]),
+        (["exchanged", "laser_angles"], "last", ["exchanged", "moved"]),
+    ],
+)
+def test_a_sensor_that_moved_is_a_cause_unless_others_explain_scattered_captures(others, place, causes):
+    found = [Finding(f"verdict.{code}") for code in others] + [MOVED(place=place)]
+    assert sorted(each.code for each in causes_of(found)) == [f"verdict.{code}" for code in causes]
+
+
+def test_angles_of_lasers_are_told_from_four_placements_on(estimate, verdict_of):
+    for n_placements, codes in ((3.0, set()), (4.0, {LASER_ANGLES.code})):
+        figures = replace(estimate.diagnostics, n_placements=n_placements)
+        _, found = verdict_of(replace(estimate, laser_angles={"azimuth": 0.5}, diagnostics=figures))
+        assert {each.code for each in found} & {LASER_ANGLES.code} == codes
+
+
 @pytest.mark.parametrize(
     ("n_misfits", "first", "moved"), [(0, "verdict.moved", "error"), (12, "verdict.intrinsics", "note")]
 )
@@ -236,6 +272,13 @@ def test_intrinsics_that_fit_few_images_come_before_captures_of_another_mounting
     verdict, findings = judge(estimate, examination, RIG, "cam", "lidar", 20, [lens], None, n_misfits)
     assert (verdict, findings[0].code) == ("fail", first)
     assert [f.severity for f in findings if f.code == "verdict.moved"] == [moved]
+
+
+def test_intrinsics_that_fit_few_images_do_not_excuse_cameras_that_moved_against_each_other(estimate):
+    moved = MOVED("left to right", captures=("000018",), n_captures=1, place="last")
+    lens = INTRINSICS(severity="warning", displacement_px=3.0, rms_px=3.0, possible_px=0.1)
+    verdict, findings = judge(estimate, examined(estimate), RIG, "cam", "lidar", 20, [lens, moved], None, 12)
+    assert (verdict, [f.code for f in findings if f.severity == "error"]) == ("fail", ["verdict.moved"])
 
 
 def test_intrinsics_that_boards_contradict_are_the_cause_of_boards_that_differ_by_their_place(estimate):
