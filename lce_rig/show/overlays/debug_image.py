@@ -24,7 +24,9 @@ BRIGHTER, DARKER = "#ff4646", "#3c96ff"
 _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
 _DIM = 0.45
-_DPI, _WIDTH_IN, _PANE_IN, _REPORT_IN = 100, 16, 5.9, 1.9
+_DPI, _WIDTH_IN, _PANE_IN = 100, 16, 5.9
+# Of a line that the board was found, and of a refusal with its action.
+_FOUND_IN, _REFUSED_IN = 0.5, 1.5
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"
 
@@ -65,11 +67,13 @@ def draw_debug(
 
     rows = [["camera", "camera", "round", "round"], ["camera", "camera", "above", "face"]]
     heights_in = [0.3 * _PANE_IN, 0.7 * _PANE_IN]
+    refused = isinstance(image_result, Refusal) or isinstance(lidar_result, Refusal) or mismatch is not None
+    report_in = _REFUSED_IN if refused else _FOUND_IN
     if image is None or events is None:
-        rows, heights_in = [*rows, ["seen", "seen", "scan", "scan"]], [*heights_in, _REPORT_IN]
+        rows, heights_in = [*rows, ["seen", "seen", "scan", "scan"]], [*heights_in, report_in]
     else:
         rows += [["events", "events", name, name] for name in ("seen", "scan", ".")]
-        heights_in += [_REPORT_IN, _REPORT_IN, _PANE_IN - 2 * _REPORT_IN]
+        heights_in += [report_in, report_in, _PANE_IN - 2 * report_in]
     height_in = sum(heights_in) + 0.4
     with context("dark_background"):
         figure: Any = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI)
@@ -220,7 +224,13 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
 def _write(pane: Any, sensor: str, refusal: Refusal | None) -> None:
     """State that a sensor found the board, or why not and what to do."""
     state, colour = ("board found", _FOUND) if refusal is None else ("refused", _REFUSED)
-    pane.text(0.02, 0.95, f"{sensor}: {state}", color=colour, fontsize=13, va="top")
+    top: dict[str, Any] = {
+        "xy": (0.02, 1),
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+        "va": "top",
+    }
+    pane.annotate(f"{sensor}: {state}", xytext=(0, -4), color=colour, fontsize=13, **top)
     if refusal is not None:
         words = "\n".join(fill(text, 90) for text in (refusal.text, refusal.advice))
-        pane.text(0.02, 0.75, words, fontsize=11, va="top")
+        pane.annotate(words, xytext=(0, -28), fontsize=11, **top)
