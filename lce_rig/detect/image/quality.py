@@ -41,8 +41,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
     grid = crossings.grid_px
     height, width = grey.shape
     is_seen = np.isfinite(grid[..., 0])
-    sides = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
-    square_px = float(np.nanmin(sides)) if np.isfinite(sides).any() else 0.0
+    square_px = _shortest_side_px(grid)
     edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
     alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
     contrast = float(abs(np.median(alternating[is_seen])))
@@ -55,6 +54,19 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
         border_px=float(to_border),
         n_corners=int(crossings.is_fitted.sum()),
     )
+
+
+def _shortest_side_px(grid_px: Array) -> float:
+    """Measure the shortest side of a square; where no two neighbours are visible, by other corners."""
+    sides = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    lengths = np.concatenate(sides)
+    if np.isfinite(lengths).any():
+        return float(np.nanmin(lengths))
+    places = np.argwhere(np.isfinite(grid_px[..., 0]))
+    seen_px = grid_px[tuple(places.T)]
+    first, second = np.triu_indices(len(places), k=1)
+    n_sides = np.linalg.norm(places[first] - places[second], axis=-1)
+    return float(np.min(np.linalg.norm(seen_px[first] - seen_px[second], axis=-1) / n_sides))
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:

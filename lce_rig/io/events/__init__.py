@@ -65,7 +65,7 @@ class EventCameraFile:
         path: the file.
         notes: assumptions on opening; after reading, losses with their causes.
         key: fingerprint of the file.
-        n_samples: number of frames.
+        n_samples: number of frames to come, estimated from the file's size.
         streams: the camera's events and, if the file and the profile have them, its frames.
         serials: the camera's serial number, if the file records it.
     """
@@ -132,7 +132,8 @@ class EventCameraFile:
             self.notes.append(f"{self.path.name}: {note}")
             return None
         self.streams.add(Stream(self._camera, channel, "images"))
-        self.n_samples = sum(1 for _ in file.packets(number, Losses()))
+        # Those of a file full of events are fewer.
+        self.n_samples = max(1, self.path.stat().st_size // first.pixels.nbytes)
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:
             exposure_ms = first.exposure_ns * 1e-6

@@ -8,6 +8,7 @@ References:
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,6 +44,17 @@ class Aedat4Frame(NamedTuple):
     pixels: NDArray[np.uint8]
 
 
+@contextmanager
+def _panics() -> Iterator[None]:
+    """Raise a ValueError in place of aedat's panic, which is no Exception: it cannot read what is damaged."""
+    try:
+        yield
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise ValueError(str(error)) from None
+
+
 class Aedat4File:
     """The streams of an AEDAT4 file.
 
@@ -69,13 +81,8 @@ class Aedat4File:
                 (n_bytes,) = struct.unpack_from("<I", header, len(_MAGIC))
                 # aedat ends the program where the header's text is none.
                 header[header.index(b"<dv") : len(_MAGIC) + 4 + n_bytes].decode()
-            try:
+            with _panics():
                 self.streams |= sorted(aedat.Decoder(path).id_to_stream().items())
-            except BaseException as error:
-                if type(error).__name__ != "PanicException":
-                    raise
-                # Of offsets beyond the header; it is no Exception.
-                raise ValueError(str(error)) from None
         source = _SOURCE.search(header)
         self.serial = source[1].decode() if source else ""
 
@@ -92,8 +99,9 @@ class Aedat4File:
             decoder, n_failures = aedat.Decoder(self.path), 0
             for number in count():
                 try:
-                    packet = next(decoder, None)
-                except RuntimeError as error:
+                    with _panics():
+                        packet = next(decoder, None)
+                except (RuntimeError, ValueError) as error:
                     n_failures += 1
                     if _TORN in str(error) or n_failures > _MOST_FAILURES:
                         losses.add(findings.TORN_END(where=f"after packet {number - 1}"))
