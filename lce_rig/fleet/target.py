@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from lce_rig.rig.profile import OutputFormat
+from lce_rig.rig.profile import OutputFormats
 from lce_rig.rig.settings import RobotName, Settings, Text, problem
 
 # Options that make ssh run a program on this computer are not among them.
@@ -56,7 +56,7 @@ class TargetSettings(Settings):
 
     to: Text
     robot: RobotName | None = None
-    formats: Annotated[tuple[OutputFormat, ...], Field(min_length=1, max_length=64)] | None = None
+    formats: Annotated[OutputFormats, Field(min_length=1, max_length=64)] | None = None
     run: Text | None = None
     run_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 60.0
     ssh: Annotated[dict[SshOption, Text | int], Field(max_length=32)] = Field(default_factory=dict)

@@ -1,10 +1,10 @@
 """The profile of a rig: start reading the schema here."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
@@ -48,6 +48,17 @@ OutputFormat = Literal[
     "mcap",
     "ply",
 ]
+
+
+def _isaac_is_urdf(formats: Any) -> Any:
+    """Put the URDF in place of `isaac`, its other name in earlier versions."""
+    if not isinstance(formats, list | tuple) or "isaac" not in formats:
+        return formats
+    others = [name for name in formats if name != "isaac"]
+    return others if "urdf" in others else [*others, "urdf"]
+
+
+OutputFormats = Annotated[tuple[OutputFormat, ...], BeforeValidator(_isaac_is_urdf)]
 
 SWAPPED_SIDES = Kind(
     "profile.swapped_sides",
@@ -235,13 +246,15 @@ class Rig(Settings):
         sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
 
+    RETIRED: ClassVar = frozenset({"reconstruction", "targets", "verdict"})
+
     format_version: Literal[1]
     name: RigName
     description: Text = ""
     robot: RobotName | None = None
     base_frame: FrameName | None = None
     mount: Mount | None = None
-    exports: tuple[OutputFormat, ...] = ()
+    exports: OutputFormats = ()
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     cameras: Annotated[dict[Name, CameraSettings], Field(max_length=_MOST_SENSORS)] = Field(

@@ -1,6 +1,6 @@
 """Base class and shared types of the profile's settings."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -10,9 +10,6 @@ _RIG_NAME = r"^[a-z0-9][a-z0-9_-]*$"
 _ROBOT = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
-
-# Keys of earlier versions: profiles that state them are read, and nothing depends on them.
-_RETIRED = {"azimuth_offset_sigma_deg", "reconstruction", "targets", "verdict"}
 
 # The meaning of each pattern, for errors.
 PATTERNS = {
@@ -39,9 +36,14 @@ Rate = Annotated[float, Field(ge=0.1, le=10_000)]
 
 
 class Settings(BaseModel):
-    """A block of a profile: immutable, no unknown keys, no infinities."""
+    """A block of a profile: immutable, no unknown keys, no infinities.
+
+    Attributes:
+        RETIRED: keys of the block in earlier versions: they are read, and nothing depends on them.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    RETIRED: ClassVar[frozenset[str]] = frozenset()
 
     @model_validator(mode="before")
     @classmethod
@@ -52,7 +54,7 @@ class Settings(BaseModel):
         for key, value in data.items():
             if any(isinstance(item, bool) for item in (value if isinstance(value, list) else [value])):
                 raise problem("a truth value (true, yes, on, false, no, off) is not allowed", str(key))
-        return {key: value for key, value in data.items() if key not in _RETIRED}
+        return {key: value for key, value in data.items() if key not in cls.RETIRED}
 
 
 def require(is_met: bool, what: str, key: str = "") -> None:

@@ -32,6 +32,12 @@ def test_a_target_is_found_in_the_file_beside_the_session_or_the_one_given(tmp_p
     assert "kestrel" in caught.value.hint
 
 
+def test_a_target_that_names_isaac_gets_the_urdf_that_it_was(tmp_path):
+    text = "targets: {heron: {to: /opt, formats: [isaac]}, kestrel: {to: /opt, formats: [isaac, urdf]}}"
+    targets = read_targets(write(tmp_path / "deploy.yaml", text))
+    assert [target.formats for target in targets.values()] == [("urdf",), ("urdf",)]
+
+
 @pytest.mark.parametrize(
     ("to", "host", "path"),
     [

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
-from lce_rig.rig import CalibrationSettings, QualitySettings, dump_rig, find_profile, load_rig, parse_rig
+from lce_rig.rig import (
+    CalibrationSettings,
+    QualitySettings,
+    dump_rig,
+    find_profile,
+    load_rig,
+    parse_rig,
+    set_value,
+)
 from lce_rig.rig.loading import Document, all_keys, rig_from_document
 from lce_rig.rig.sensors import LidarSettings
 
@@ -279,4 +287,31 @@ def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerb
 
 
 def test_keys_of_earlier_versions_are_read_and_mean_nothing():
-    assert parse_rig(RLFS + "verdict: {max_change: 2}\nreconstruction: {}\n") == parse_rig(RLFS)
+    old = RLFS + "verdict: {max_change: 2}\nreconstruction: {}\ntargets: {}\n"
+    old = set_value(old, "lidars.lidar.azimuth_offset_sigma_deg", "0.1")
+    assert parse_rig(old) == parse_rig(RLFS)
+
+
+@pytest.mark.parametrize("key", ["verdict", "targets", "reconstruction", "azimuth_offset_sigma_deg"])
+def test_keys_of_earlier_versions_are_refused_where_they_never_stood(key):
+    with pytest.raises(ProfileError, match=rf"board\.{key}"):
+        parse_rig(set_value(RLFS, f"board.{key}", "1"))
+
+
+@pytest.mark.parametrize(
+    ("stated", "read"),
+    [
+        ("[isaac]", ("urdf",)),
+        ("[isaac, kalibr]", ("kalibr", "urdf")),
+        ("[urdf, isaac, kalibr]", ("urdf", "kalibr")),
+        ("[isaac, isaac]", ("urdf",)),
+    ],
+)
+def test_isaac_is_read_as_the_urdf_that_it_was(stated, read):
+    assert parse_rig(set_value(RLFS, "exports", stated)).exports == read
+
+
+@pytest.mark.parametrize("exports", ["isaac", "[[isaac]]", "[{isaac: 1}]", "[isaac, nonsense]"])
+def test_exports_that_are_no_list_of_formats_are_refused(exports):
+    with pytest.raises(ProfileError, match="exports"):
+        parse_rig(set_value(RLFS, "exports", exports))
