@@ -109,12 +109,14 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 
 def _entries(manifest: Storage, content: bytes) -> list[Entry]:
     """Read a manifest."""
+    text = content.decode(errors="replace")
+    below = "List entries with `path` below `sessions:`; see docs/fleets.md."
     try:
-        document = read_document(content.decode(errors="replace"), manifest.url)
+        document = read_document(text, manifest.url, "a fleet's manifest", below)
         try:
             return _Manifest.model_validate(document.data).sessions
         except ValidationError as error:
-            raise explain(error, document) from None
+            raise explain(error, document, _Manifest) from None
     except ProfileError as error:
         hint = f"Keys below `sessions:`: {', '.join(Entry.model_fields)}; see docs/fleets.md."
         raise UsageError(error.what, error.hint or hint) from None

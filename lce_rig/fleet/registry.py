@@ -165,9 +165,7 @@ def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None
         with (
             place.reached() as (fs, path),
             fs.open(path) as file,
-            reading(
-                place.url, SessionError, "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
-            ),
+            reading(place.url, SessionError, _WRITE_AGAIN),
         ):
             table = pq.read_table(file, columns=names)
             if table.column_names != names:

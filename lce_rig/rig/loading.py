@@ -33,6 +33,7 @@ _REWORDED = (
     ("a valid ", "a "),
     ("a tuple", "a list"),
     ("a dictionary", "a block of keys"),
+    ("Value error, ", ""),
     (" after validation", ""),
 )
 
@@ -199,8 +200,19 @@ class Document:
         return line
 
 
-def read_document(text: str, source: str) -> Document:
+def read_document(
+    text: str,
+    source: str,
+    kind: str = "a rig profile",
+    hint: str = "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`",
+) -> Document:
     """Parse YAML text by the safe loader.
+
+    Args:
+        text: the YAML.
+        source: name of the text in errors, usually its file.
+        kind: of file, for the error of a text that is no mapping.
+        hint: of that error.
 
     Raises:
         ProfileError: not YAML, not a mapping, or a key given twice; with file and line.
@@ -216,10 +228,7 @@ def read_document(text: str, source: str) -> Document:
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
         raise ProfileError(f"{source}: not YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(data, dict):
-        raise ProfileError(
-            f"{source}: is not a rig profile: expected a mapping of keys",
-            "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`",
-        )
+        raise ProfileError(f"{source}: is not {kind}: expected a mapping of keys", hint)
     return Document(source, data, root)
 
 

@@ -56,12 +56,26 @@ def test_a_manifest_names_robot_and_profile_by_patterns(tmp_path):
         "sessions: [{path: a, robot: " + "1" * 5000 + "}]",
         'sessions: [{path: "a\\0b"}]',
         "sessions: [{path: 2026-13-45T99:99:99Z}]",
+        "sessions: [{path: a, name: b}]",
+        "sessions: [{path: a, robt: b}]",
+        "[{path: a}]",
+        "",
     ],
 )
 def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
     lay_out(tmp_path, "a")
     (tmp_path / "fleet.yaml").write_text(text)
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError) as caught:
+        find_jobs(Storage.at(tmp_path))
+    said = f"{caught.value.what} {caught.value.hint}"
+    assert caught.value.exit_code == 2 and "fleet.yaml" in said and "docs/fleets.md" in said
+    assert "rig profile" not in said and "rigs new" not in said and "top level" not in said
+
+
+def test_a_misspelt_key_of_a_manifest_is_told_the_nearest(tmp_path):
+    lay_out(tmp_path, "a")
+    (tmp_path / "fleet.yaml").write_text("sessions: [{path: a, robt: b}]")
+    with pytest.raises(UsageError, match=r"sessions\.0\.robt.*robot"):
         find_jobs(Storage.at(tmp_path))
 
 
