@@ -39,10 +39,11 @@ from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, lens_settings, parse_rig, set_value
 from lce_rig.rig.sensors import lens_block
 from lce_rig.session import Capture, Session
-from lce_rig.session.durable import write_atomically
+from lce_rig.session.durable import replacing, write_atomically
 from lce_rig.session.session import INTRINSICS
 
 Key = tuple[str, str]
@@ -272,12 +273,29 @@ def _fit(
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write a camera_info file for each camera into intrinsics/ of the session; raises as `writing`."""
-    files = []
-    for one in measured:
-        files.append(session.path / INTRINSICS / f"camera_info_{one.camera}.yaml")
-        write_atomically(files[-1], camera_info_text(one.camera, one.intrinsics, _head(session.rig, one)))
-    return files
+    """Write the session's intrinsics/ in one step: a camera_info file for each camera.
+
+    Other files there stay, as those of cameras that an earlier run measured. Figures and plots that an
+    earlier version wrote of these cameras leave.
+
+    Returns:
+        The files of this run.
+
+    Raises:
+        SessionError: as `replacing`; earlier files are unchanged.
+    """
+    place = session.path / INTRINSICS
+    names = {f"camera_info_{one.camera}.yaml": one for one in measured}
+    of_earlier = {"intrinsics.json", *(f"{one.camera}.png" for one in measured)}
+
+    def finish(earlier: Path, draft: Path) -> None:
+        keep_foreign(earlier, draft, lambda path: path.name in of_earlier)
+
+    with replacing(session.path, place, finish) as draft:
+        for name, one in names.items():
+            text = camera_info_text(one.camera, one.intrinsics, _head(session.rig, one))
+            write_atomically(draft / name, text)
+    return [place / name for name in names]
 
 
 def save_profile(

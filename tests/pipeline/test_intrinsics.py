@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.camera_intrinsics import (
@@ -127,6 +127,21 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     assert one["intrinsics"]["cy_px"] == lens.cy_px
     assert one["profile"]["verdict"] == "pass"
     assert one["views_used"] == [f"{k:06d}.frames" for k in range(8)]
+
+
+def test_files_of_one_run_stand_together_and_those_of_others_stay(pictures, measured, tmp_path):
+    session = session_of(tmp_path / "session", pictures[:1])
+    folder = session.path / "intrinsics"
+    folder.mkdir()
+    for name in ("intrinsics.json", "davis.png", "camera_info_other.yaml", "notes.txt"):
+        (folder / name).write_text("earlier")
+    other = replace(measured, camera="longer_than_the_name_of_a_file" * 10)
+    with pytest.raises(SessionError):
+        write_intrinsics(session, [measured, other])
+    assert (folder / "davis.png").read_text() == (folder / "intrinsics.json").read_text() == "earlier"
+    assert write_intrinsics(session, [measured]) == [folder / "camera_info_davis.yaml"]
+    kept = {"camera_info_davis.yaml", "camera_info_other.yaml", "notes.txt"}
+    assert {path.name for path in folder.iterdir()} == kept
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
