@@ -51,6 +51,15 @@ class Entry(_Record):
     first_ns: _Stamp = None
     last_ns: _Stamp = None
 
+    @model_validator(mode="after")
+    def _has_the_fields_of_its_kind(self) -> "Entry":
+        sensor = ("lidar",) if self.kind == "scan" else ("camera", "channel")
+        stamps = ("first_ns", "last_ns") if self.kind == "events" else ("stamp_ns",)
+        for field in (*sensor, *stamps):
+            if field not in self.model_fields_set:
+                raise ValueError(f"{self.kind} without {field}")
+        return self
+
     @property
     def source(self) -> str:
         """What it holds, such as "image of cam.frames"."""

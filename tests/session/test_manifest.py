@@ -43,6 +43,18 @@ def test_values_of_the_wrong_kind_are_named_with_their_key(capture, changes):
         capture.check()
 
 
+@pytest.mark.parametrize(
+    ("index", "field"), [(0, "camera"), (0, "channel"), (0, "stamp_ns"), (1, "lidar"), (1, "stamp_ns")]
+)
+def test_a_field_that_an_entry_lacks_is_named(capture, index, field):
+    path = capture.path / "meta.json"
+    manifest = json.loads(path.read_text())
+    del manifest["files"][index][field]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(SessionError, match=rf"meta\.json: files\.{index}: .*{field}"):
+        capture.check()
+
+
 def test_a_sensor_named_twice_is_refused(capture):
     path = capture.path / "meta.json"
     manifest = json.loads(path.read_text())
