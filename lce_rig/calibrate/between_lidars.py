@@ -27,7 +27,7 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.findings import FEW_AGREE, TURNED
-from lce_rig.calibrate.likelihood.fit import fit_boards
+from lce_rig.calibrate.likelihood.fit import JointEstimate, fit_boards
 from lce_rig.calibrate.likelihood.layout import OWN
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.likelihood.rays import lens_fields
@@ -74,13 +74,13 @@ class PlacedBoards:
         T: (F, 4, 4) T_lidar_board.
         cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
         shared: (F, 6, m) tangents by m independent errors of unit variance, common to all captures.
-        laser_angles: as of `CalibrationEstimate`.
+        joint: the estimate they are of.
     """
 
     T: Array
     cov: Array
     shared: Array
-    laser_angles: Mapping[str, float]
+    joint: JointEstimate
 
 
 class PairEstimate(NamedTuple):
@@ -118,7 +118,7 @@ def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateS
     values, vectors = np.linalg.eigh(np.einsum("fij,fik->jk", shared, shared))
     kept = vectors[:, values > _NEGLIGIBLE**2 * values[-1]]
     of_own = np.asarray(np.linalg.inv(reduced.of_own), dtype=np.float64)
-    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept), laser_angles(joint))
+    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept), joint)
 
 
 def estimate_between_lidars(
@@ -144,29 +144,25 @@ def estimate_between_lidars(
             direction undetermined, which is named.
     """
     consensus = find_consensus(candidates, board)
-    agreed = {o.capture: o for o in consensus.observations}
-    every = [agreed.get(o.capture, o) for o in sorted(candidates, key=lambda o: o.capture)]
-    seen = []
-    for o in every:
-        apart_m = [
-            np.linalg.norm((each.T_lidar_board - o.image.T_cam_board)[:3, 3]) for each in first[o.capture]
-        ]
-        seen.append(first[o.capture][int(np.argmin(apart_m))])
-    one = place_boards(seen, board, settings[0])
-    T_view = optical_frame(one.T[[o.capture in agreed for o in every], :3, 3])
+    agreed = consensus.observations
+    one = place_boards([_board_of(o, first[o.capture]) for o in agreed], board, settings[0])
+    T_view = optical_frame(one.T[:, :3, 3])
     R = np.kron(np.eye(2), T_view[:3, :3])
-    refused, placed, observations = dict(consensus.refused), [], []
-    for o, T, cov in zip(every, one.T, one.cov, strict=True):
-        image = replace(o.image, T_cam_board=T_view @ T, cov=R @ cov @ R.T, T_cam_board_alternative=None)
-        placed.append(replace(o, image=image))
-        if o.capture not in agreed:
-            continue
-        turn, spin_rad = _turn_alike(T, consensus.T_cam_lidar @ o.lidar.T_lidar_board, board)
+    one = replace(one, T=T_view @ one.T, cov=R @ one.cov @ R.T, shared=R @ one.shared)
+    seen, refused, observations = {}, dict(consensus.refused), []
+    for o in candidates:
+        if o.capture in refused:
+            # Alone: another plate would bend the errors that all captures share.
+            alone = place_boards([_board_of(o, first[o.capture])], board, settings[0])
+            seen[o.capture] = _with_pose(o, T_view @ alone.T[0], R @ alone.cov[0] @ R.T)
+    for o, T, cov in zip(agreed, one.T, one.cov, strict=True):
+        seen[o.capture] = o = _with_pose(o, T, cov)
+        turn, spin_rad = _turn_alike(T, T_view @ consensus.T_cam_lidar @ o.lidar.T_lidar_board, board)
         if spin_rad > _MOST_TURN_RAD:
             refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spin_rad)))
             continue
         lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turn)
-        observations.append(replace(o, image=image, lidar=lidar))
+        observations.append(replace(o, lidar=lidar))
     if len(observations) < len(agreed) / 2:
         raise NotEnoughDataError.of(
             FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))
@@ -174,13 +170,11 @@ def estimate_between_lidars(
     start = solve(observations, board)
     start = replace(start, refused=refused | dict(start.refused))
     used = {o.capture for o in start.observations}
-    is_used = [o.capture in used for o in every]
-    cov = (R @ one.cov @ R.T)[is_used]
-    one = replace(one, T=(T_view @ one.T)[is_used], cov=cov, shared=(R @ one.shared)[is_used])
+    is_used = [o.capture in used for o in agreed]
+    one = replace(one, T=one.T[is_used], cov=one.cov[is_used], shared=one.shared[is_used])
     other = place_boards([o.lidar for o in start.observations], board, settings[1])
     estimate = _fit_poses(start, one, other, board)
-    rejected = [o for o, is_one in zip(placed, is_used, strict=True) if not is_one]
-    return PairEstimate(estimate, rejected, T_view)
+    return PairEstimate(estimate, [seen[name] for name in sorted(seen.keys() - used)], T_view)
 
 
 def close_loops(edges: Mapping[tuple[str, str], tuple[Array, Array]]) -> dict[tuple[str, str], Array]:
@@ -234,6 +228,17 @@ def optical_frame(middles: Array) -> Array:
     forward = towards / length if length > 0 else np.array([1.0, 0.0, 0.0])
     down = np.array([0.0, 0.0, -1.0])
     return pose(np.stack([np.cross(down, forward), down, forward]), np.zeros(3))
+
+
+def _board_of(observation: Observation, places: Sequence[LidarBoard]) -> LidarBoard:
+    """Choose the place in the first LiDAR's scan whose pose an observation has as the image's."""
+    middle = observation.image.T_cam_board[:3, 3]
+    return min(places, key=lambda each: float(np.linalg.norm(each.T_lidar_board[:3, 3] - middle)))
+
+
+def _with_pose(observation: Observation, T: Array, cov: Array) -> Observation:
+    image = replace(observation.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None)
+    return replace(observation, image=image)
 
 
 def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
@@ -291,4 +296,4 @@ def _fit_poses(start: Start, one: PlacedBoards, other: PlacedBoards, board: Boar
     cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
     figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
     estimate = report(start, T, cov, board, figures)
-    return replace(estimate, method="ml", laser_angles=other.laser_angles)
+    return replace(estimate, method="ml", laser_angles=laser_angles(other.joint))

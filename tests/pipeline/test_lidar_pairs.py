@@ -138,6 +138,23 @@ def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
     assert caught.value.finding.code == "shortage.few_detected"
 
 
+def test_another_plate_in_the_first_lidars_scan_does_not_move_the_result():
+    rig = make_rig()
+    board = rig.board.to_board()
+    scans, rng = scan_both(16, 5, board), np.random.default_rng(0)
+    wrong = list(scans["left"])[2::4]
+    table = replace(board, width_m=0.86, height_m=0.74)
+    for k, name in enumerate(wrong):
+        R = exp_so3(np.array([0.0, np.radians(-60.0), 0.0])) @ exp_so3(np.array([0.0, 0.0, 0.6]))
+        T = pose(R, np.array([2.2, 1.4 - 0.1 * k, -0.1]))
+        scans["left"][name] = [scan_board(T, rng, Scenario(range_sigma_m=0.02), table)]
+    alone = {lidar: {k: v for k, v in found.items() if k not in wrong} for lidar, found in scans.items()}
+    result, without = calibrate(rig, scans), calibrate(rig, alone)
+    assert set(wrong) <= set(result.captures_refused)
+    assert np.allclose(result.T_cam_lidar, without.T_cam_lidar, atol=1e-9)
+    assert np.allclose(result.cov, without.cov, rtol=1e-6, atol=1e-14)
+
+
 def test_a_result_of_lidars_is_read_back_and_exported(tmp_path):
     rig = make_rig()
     result = calibrate(rig, scan_both(14, 2, rig.board.to_board()))
