@@ -32,6 +32,8 @@ from lce_rig.export.robot_tree import RobotTree
 from lce_rig.export.writing import quaternion_xyzw, rpy
 from lce_rig.lens.models import MODELS, convert, grid_rays
 
+# A pixel that a model cannot draw counts as this far off.
+_UNDRAWN_PX = 100.0
 # Above this the error is visible in matching and colouring.
 _COARSE_PX = 0.5
 _KOIDE3_MODELS = {"radtan": "plumb_bob", "equidistant": "fisheye"}
@@ -57,7 +59,8 @@ def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
     if len(given.distortion) <= n:
         return lens, 0.0, 0.0
     pixels, rays = grid_rays(given)
-    miss_px = np.linalg.norm(lens.project(rays)[0] - pixels, axis=1)
+    off_px = np.nan_to_num(lens.project(rays)[0] - pixels, nan=_UNDRAWN_PX)
+    miss_px = np.linalg.norm(off_px, axis=1)
     return lens, float(np.sqrt(np.mean(miss_px**2))), float(miss_px.max())
 
 

@@ -12,6 +12,9 @@ from lce_rig.rig import BoardSettings, CameraSettings
 # Models are compared on the rays of a grid of this many points across the image.
 _GRID = 24
 _STEPS = 20
+# So far beyond the outermost ray, and by so much there, a converted model still draws rays farther out.
+_RIM_RAD, _RISE_PX = 2e-3, 1e-3
+_HOLDS = 1e4
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,8 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     """Find the parameters (P,) of another model with about the same projection.
 
     Exact where the new model contains the old one; else least squares over a grid of pixels, within the field
-    of view where the old model is valid.
+    of view where the old model is valid. There the new one must not fold back: a free fit can do so next to
+    the outermost ray, which the model then cannot draw.
     """
     if intrinsics.model == model.family and len(intrinsics.distortion) <= len(model.coefficients):
         return model.vector(intrinsics)
@@ -124,11 +128,21 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
         ]
     )
     ridge = np.concatenate([np.zeros(4), np.ones(model.size - 4)])
+    # From opposite sides, half the difference is without decentring, which does not make a lens fold.
+    angle = np.arccos(rays[:, 2].min())
+    rim = [[side * np.sin(a), 0.0, np.cos(a)] for side in (1, -1) for a in (angle + _RIM_RAD, angle)]
+    half = np.array([0.5, -0.5, -0.5, 0.5])
     for _ in range(_STEPS):
         predicted, _, J = model.project(vector, rays)
         J = J.reshape(-1, model.size)
         H = J.T @ J + np.diag(ridge)
-        vector = vector - np.linalg.solve(H, J.T @ (predicted - pixels).ravel() + ridge * vector)
+        g = J.T @ (predicted - pixels).ravel() + ridge * vector
+        at_rim, _, J = model.project(vector, np.array(rim))
+        lack_px, slope = half @ at_rim[:, 0] - _RISE_PX, half @ J[:, 0]
+        if lack_px < 0:
+            H += _HOLDS**2 * np.outer(slope, slope)
+            g += _HOLDS**2 * slope * lack_px
+        vector = vector - np.linalg.solve(H, g)
     return vector
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lce_rig.core.calibration import Calibration
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export
@@ -19,6 +20,7 @@ from lce_rig.export.robot_tree import Joint, RobotTree
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
 from lce_rig.export.writing import T_BODY_OPTICAL
+from lce_rig.lens.models import grid_rays
 from tests.export.conftest import reason
 
 Make = Callable[..., Calibration]
@@ -199,6 +201,18 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make
     (finding,) = findings
     assert (finding.code, finding.subject) == ("export.lens_fitted", "left")
     assert f"{finding.figure('max_px'):.3g} px" in files[0].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("focal_px", "limit_px"), [(900, 0.2), (450, 0.1), (300, 0.1)])
+def test_a_wide_lens_with_fewer_coefficients_draws_the_whole_image(focal_px, limit_px):
+    """At 900 px the five coefficients that fit best fold back before the image's corner."""
+    coefficients = (-0.4, 0.2, 0.001, 0.0, -0.05, 0.1, -0.02, 0.01)
+    true = Intrinsics(focal_px, focal_px, 640, 360, 1280, 720, "radtan", coefficients)
+    lens, rms_px, max_px = fit_lens(true, "radtan5")
+    rays = grid_rays(true)[1]
+    assert lens.project(rays)[1].all()
+    assert rms_px < limit_px
+    assert max_px < 1.0
 
 
 @pytest.mark.parametrize("n_coefficients", [4, 5])
