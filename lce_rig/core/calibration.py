@@ -255,7 +255,7 @@ class CaptureResidual(NamedTuple):
         capture: its name.
         plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
         edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
-        held_out_m: rms of both where the capture was not fitted; NaN of two LiDARs.
+        held_out_m: rms of both where the capture was not fitted; of two LiDARs by Algorithm 1, their start.
         reprojection_px: rms corner residual of the board's pose.
     """
 

@@ -121,14 +121,18 @@ def _fit_rows(c: Calibration) -> list[Row]:
         ("captures in which both sensors found the board", f"{c.n_detected} of {c.n_captures}"),
         (f"LiDAR points from the board planes of {first}, mean", f"{1000 * c.metrics.mpe_m:.1f} mm"),
         ("ring ends from the board's edges, mean", f"{1000 * c.metrics.mee_m:.1f} mm"),
-        ("held-out captures, rms", f"{1000 * c.diagnostics.held_out_m:.1f} mm"),
+        ("held-out captures, mean of their rms", _if_known(1000 * c.diagnostics.held_out_m, ".1f", "mm")),
         (
             "corners from the board's best pose in each image, rms",
-            f"{c.metrics.reprojection_px:.2f} px",
+            _if_known(c.metrics.reprojection_px, ".2f", "px"),
         ),
         (f"{start} is the global minimum of its cost", proof),
     ]
-    return [row for row in rows if "nan" not in row[1]]
+    return [row for row in rows if row[1]]
+
+
+def _if_known(value: float, digits: str, unit: str) -> str:
+    return f"{value:{digits}} {unit}" if math.isfinite(value) else ""
 
 
 _FIGURES = ("planes", "edges", "held out", "corners")
@@ -138,9 +142,9 @@ def _capture_rows(c: Calibration) -> list[Row]:
     """List the residuals of each capture, "" where there is none."""
     rows: list[Row] = []
     for r in c.residuals:
-        in_mm = (f"{1000 * value:.1f} mm" for value in (r.plane_mean_m, r.edge_mean_m, r.held_out_m))
-        cells = (*in_mm, f"{r.reprojection_px:.2f} px")
-        rows.append((r.capture, *("" if "nan" in cell else cell for cell in cells)))
+        sizes_m = (r.plane_mean_m, r.edge_mean_m, r.held_out_m)
+        in_mm = (_if_known(1000 * value, ".1f", "mm") for value in sizes_m)
+        rows.append((r.capture, *in_mm, _if_known(r.reprojection_px, ".2f", "px")))
     return rows
 
 
