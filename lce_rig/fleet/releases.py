@@ -36,7 +36,8 @@ def read_targets(path: Path) -> dict[str, TargetSettings]:
     Raises:
         ProfileError: no such file, or an invalid one; every problem with line and key.
     """
-    document = read_document(read_profile(path), str(path))
+    hint = "List targets by name below `targets:`; see docs/robot.md."
+    document = read_document(read_profile(path), str(path), "a list of targets", hint)
     try:
         content = _TargetsFile.model_validate(document.data)
     except ValidationError as error:

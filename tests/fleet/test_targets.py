@@ -32,6 +32,14 @@ def test_a_target_is_found_in_the_file_beside_the_session_or_the_one_given(tmp_p
     assert "kestrel" in caught.value.hint
 
 
+@pytest.mark.parametrize("text", ["", "[heron]"])
+def test_a_file_that_lists_no_targets_is_not_told_how_to_write_a_profile(tmp_path, text):
+    with pytest.raises(ProfileError) as caught:
+        read_targets(write(tmp_path / "deploy.yaml", text))
+    assert "deploy.yaml" in caught.value.what and "targets:" in caught.value.hint
+    assert "rigs new" not in caught.value.hint
+
+
 def test_a_target_that_names_isaac_gets_the_urdf_that_it_was(tmp_path):
     text = "targets: {heron: {to: /opt, formats: [isaac]}, kestrel: {to: /opt, formats: [isaac, urdf]}}"
     targets = read_targets(write(tmp_path / "deploy.yaml", text))
