@@ -28,7 +28,7 @@ from lce_rig.calibrate.observations import Clocks, join_scans
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.session_lens import fit_session_lens
-from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter, with_profile
+from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
@@ -137,10 +137,12 @@ def estimate_observations(
     start = solve(observations, board)
     begin(progress, "maximum likelihood")
     priors, usual = what_is_known(settings)
-    joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
+    joint = maximise_likelihood(
+        [start.observations], board, [start.T_cam_lidar], priors, usual, lenses=[settings.lens]
+    )
     if settings.method == "paper":
         return by_scatter(start, joint, board, settings)
-    return with_profile(by_likelihood(start, joint, board), joint, board, settings)
+    return by_likelihood(start, joint, board, settings.lens)
 
 
 def _with_session_lens(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import ends_on_board, extract_features, plane_residuals
 from lce_rig.calibrate.session_lens import SessionLens
@@ -81,6 +82,8 @@ class CalibrationEstimate:
             its standard deviation at usual noise, both by the likelihood; None without it.
         laser_angles: rms error of the lasers' azimuths and elevations, deg, as `uncertainty.laser_angles`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
+        cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
+        joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: of the camera, with the time offset of each; empty if they were not separated.
@@ -100,18 +103,12 @@ class CalibrationEstimate:
     turns: Array | None = None
     laser_angles: Mapping[str, float] = field(default_factory=dict)
     lens: SessionLens | None = None
+    cov_with_lens: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    joint: tuple[JointEstimate, int] | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()
     channel_difference: PoseDifference | None = None
-
-    @property
-    def cov_with_lens(self) -> Array:
-        """Cross-covariance (6, P) of extrinsics as used and intrinsics; empty without a session's lens."""
-        if self.lens is None:
-            return np.zeros((6, 0))
-        (by_lens,) = (each for each in self.sensitivities if each.source == "intrinsics")
-        return np.asarray(by_lens.moves.T @ self.lens.directions[:, : self.lens.estimate.model.size])
 
     @property
     def used(self) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
-from lce_rig.core.results import Observation
+from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.fit import fit_poses, pose_moves
@@ -30,6 +30,9 @@ from lce_rig.lens.models import LensPrior, model_of
 
 # More images hardly improve a lens, and take time.
 _MAX_VIEWS = 80
+# Typical noise of a pose, m and rad; errors below this fraction of it, over all images, are negligible.
+_NOISE = np.repeat([1e-3, 5e-4], 3)
+_NEGLIGIBLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,17 +65,26 @@ class SessionLens:
         variances, axes = np.linalg.eigh(cov / np.outer(sigma, sigma))
         return np.asarray((np.sqrt(np.maximum(variances, 0.0)) * axes).T * sigma)
 
-    @property
-    def turns(self) -> Array:
-        """Rotations (n, 3) of the camera that project like `directions`."""
-        by_lens = turn_of_lens(self.intrinsics)
-        return np.asarray(self.directions[:, : by_lens.shape[1]] @ by_lens.T)
+    def errors(self, images: Sequence[ImageBoard]) -> tuple[Array, Array, Array]:
+        """List independent errors of lens and board, of unit variance, that matter in F images.
 
-    def moves(self, observations: Sequence[Observation]) -> Array:
-        """Compute how far each of `directions` moves the fitted poses of F captures: (n, F, 6) tangents."""
-        corners_px = np.array([o.image.corners_px for o in observations])
-        poses = np.array([o.image.T_cam_board for o in observations])
-        return pose_moves(self.estimate, corners_px, poses, self.directions)
+        Errors that move the poses of all images together by a fraction of their noise are left out.
+
+        Returns:
+            (F, 6, n) tangents by which each moves the fitted poses, (n, P) by which it moves the intrinsics,
+            and (3, n) rotations of the camera that project like it.
+        """
+        corners_px = np.array([image.corners_px for image in images])
+        poses = np.array([image.T_cam_board for image in images])
+        moves = pose_moves(self.estimate, corners_px, poses, self.directions)
+        by_lens = turn_of_lens(self.intrinsics)
+        P = by_lens.shape[1]
+        effects = (moves / _NOISE).reshape(len(moves), -1)
+        effects = np.hstack([effects, self.directions[:, :P] @ by_lens.T / _NOISE[3:]])
+        axes, sizes, _ = np.linalg.svd(effects, full_matrices=False)
+        axes = axes[:, sizes > _NEGLIGIBLE].T
+        of_lens = axes @ self.directions[:, :P]
+        return np.moveaxis(np.tensordot(axes, moves, axes=1), 0, -1), of_lens, by_lens @ of_lens.T
 
     def refit(self, observations: Sequence[Observation]) -> list[Observation]:
         """Fit the poses of observations anew with this lens and board."""

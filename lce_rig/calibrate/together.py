@@ -32,8 +32,7 @@ class TogetherEstimate:
     Attributes:
         cameras: their names, sorted.
         estimates: of each.
-        cov: (6 C, 6 C) of all extrinsics, in the order of `cameras`; its diagonal blocks are those of the
-            estimates.
+        cov: (6 C, 6 C) of all extrinsics, in the order of `cameras`, with errors of lens and board.
     """
 
     cameras: tuple[str, ...]
@@ -71,32 +70,30 @@ def calibrate_together(
         for observation in start.observations:
             scans.setdefault(scan_key(observation), f"{len(scans):06d}")
         labelled.append([replace(o, capture=scans[scan_key(o)]) for o in start.observations])
-    known = [what_is_known(options[name]) for name in names]
-    usual = known[0][1]
-    priors = replace(known[0][0], scale=tuple(float(np.ravel(each.scale)[0]) for each, _ in known))
+    priors, usual = what_is_known(options[names[0]])
     T_start = [start.T_cam_lidar for start in starts]
     # Pose errors of the cameras' images, as each alone estimates them, compared with their geometric mean.
     figures = [start.diagnostics for start in starts]
     logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
     ratios = [dict(zip(OF_IMAGES, own, strict=True)) for own in np.exp(logs - logs.mean(axis=0)).tolist()]
-    joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=ratios)
+    lenses = [alone[name].lens for name in names]
+    joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=ratios, lenses=lenses)
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
     scales, estimates = [], {}
     for k, (name, start) in enumerate(zip(names, starts, strict=True)):
         own = alone[name]
-        estimate = by_likelihood(start, joint, board, k)
+        estimate = by_likelihood(start, joint, board, own.lens, k)
         scales.append(np.full(6, np.sqrt(estimate.diagnostics.covariance_inflation)))
         estimates[name] = replace(
             estimate,
-            sensitivities=own.sensitivities,
-            lens=own.lens,
             estimated_with=tuple(other for other in names if other != name),
             same_scan=own.same_scan,
             channels=own.channels,
             channel_difference=own.channel_difference,
         )
     scale = np.concatenate(scales)
-    cov = scale[:, None] * (J @ joint.cov_z @ J.T) * scale
+    cov = scale[:, None] * (J @ sum(joint.covariances) @ J.T) * scale
+    cov += sum(J @ moves @ moves.T @ J.T for moves in joint.moves.values())
     return TogetherEstimate(names, estimates, cov)
 
 

@@ -1,17 +1,16 @@
 """Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
-from lce_rig.calibrate.likelihood.layout import LASER, OWN, SHIFTS
+from lce_rig.calibrate.likelihood.images import stack_images
+from lce_rig.calibrate.likelihood.layout import LASER, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
-from lce_rig.calibrate.likelihood.model import assemble, linearise
-from lce_rig.calibrate.likelihood.rays import interior, stack_scans
+from lce_rig.calibrate.likelihood.model import assemble
 from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
 from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
@@ -20,14 +19,11 @@ from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
 from lce_rig.core.geometry import Array, chance_of, invert, transform
-from lce_rig.core.results import Observation
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
 # Angles of lasers with a loose prior, and the chance below which they are not those of the scans.
 _LOOSE_RAD, _CHANCE = np.radians(1.0), 1e-4
-# Effects of the plate's size are linear: a step only keeps clear of rounding.
-_STEP_M = 1e-3
 
 
 def by_scatter(
@@ -52,13 +48,13 @@ def by_scatter(
     figures = with_parts(figures, scatter, systematic)
     estimate = report(start, start.T_cam_lidar, cov[:6, :6], board, figures)
     sensitivities: tuple[Sensitivity, ...] = ()
+    cov_with_lens = np.zeros((6, 0))
     if settings.tolerances is not None:
-        sensitivities = _sensitivities(
-            start.fitted,
+        sensitivities, cov_with_lens = _sensitivities(
+            start,
             board,
             settings.tolerances,
             settings.lens,
-            partial(_moves_by_poses, start),
             {"plate_size": by_plate[:, :6], "board_bow": by_bow[:, :6]},
         )
     return replace(
@@ -68,6 +64,8 @@ def by_scatter(
         turns=_turns(joint),
         laser_angles=laser_angles(joint),
         lens=settings.lens,
+        cov_with_lens=cov_with_lens,
+        joint=(joint, 0),
     )
 
 
@@ -137,38 +135,35 @@ def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
 
 
 def _sensitivities(
-    observations: Sequence[Observation],
+    start: Algorithm1,
     board: Board,
     known: Tolerances,
     lens: SessionLens | None,
-    moves_by_poses: Callable[[Array], Array],
     of_scans: Mapping[Source, Array],
-) -> tuple[Sensitivity, ...]:
-    """Collect the moves of a method's result by errors of lens and board.
+) -> tuple[tuple[Sensitivity, ...], Array]:
+    """Collect the moves of Algorithm 1's solution by errors of lens and board.
 
     Args:
-        observations: F captures.
+        start: the solution.
         board: as the profile says.
         known: standard deviations of the errors.
         lens: of the session; None leaves its errors out.
-        moves_by_poses: the moves (n, 6) of the result where T_cam_board of each capture moves by tangents
-            (n, F, 6).
         of_scans: by source the moves (n, 6) of the result by other errors.
+
+    Returns:
+        The moves, and the cross-covariance (6, P) of extrinsics and intrinsics.
     """
-    poses = np.array([observation.image.T_cam_board for observation in observations])
-    R, t = poses[:, :3, :3], poses[:, :3, 3]
-    moves: dict[Source, Array] = {}
+    boards = [observation.image for observation in start.fitted]
+    images = stack_images(np.arange(len(boards)), boards, board.pattern_offset_m, lens)
+    by_error = _moves_by_poses(start, np.moveaxis(images.errors, -1, 0))
+    # The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
+    by_lens = by_error[3:] + np.pad(images.turns.T, ((0, 0), (3, 0)))
+    moves: dict[Source, Array] = {"square_size": by_error[:1], "pattern_offset": by_error[1:3]}
     if lens is not None:
-        # The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
-        turns = np.pad(lens.turns, ((0, 0), (3, 0)))
-        moves["intrinsics"] = moves_by_poses(lens.moves(observations)) + turns
-    # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
-    farther, beside = t + R @ [*board.pattern_offset_m, 0.0], -np.moveaxis(R[:, :, :2], 2, 0)
-    of_pattern: dict[Source, Array] = {"square_size": farther[None], "pattern_offset": beside}
-    for source, shifts in of_pattern.items():
-        moves[source] = moves_by_poses(np.concatenate([shifts, np.zeros_like(shifts)], axis=2))
+        moves["intrinsics"] = by_lens
     moves |= of_scans
-    return tuple(Sensitivity(source, known.sigma(source), each) for source, each in moves.items())
+    found = tuple(Sensitivity(source, known.sigma(source), each) for source, each in moves.items())
+    return found, by_lens.T @ images.of_lens
 
 
 def systematic_covariances(
@@ -195,8 +190,10 @@ def systematic_covariances(
     return of_each, sigma_common**2 * common @ np.swapaxes(common, -1, -2)
 
 
-def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int = 0) -> CalibrationEstimate:
-    """Report the joint estimate of a camera, without errors of its lens and the board.
+def by_likelihood(
+    start: Start, joint: JointEstimate, board: Board, lens: SessionLens | None, camera: int = 0
+) -> CalibrationEstimate:
+    """Report the joint estimate of a camera.
 
     Certificate, outliers and held-out residuals are those of Algorithm 1, from whose solution it starts.
 
@@ -204,31 +201,27 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
         start: Algorithm 1's solution.
         joint: of F captures.
         board: its specification.
+        lens: of the camera; None where it is exact.
         camera: its number.
     """
     moves = joint.cost.moves() @ joint.to_extrinsics[camera].T
     n_placements = len(np.unique(joint.placement[joint.terms.images[camera].capture]))
-    cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
-    figures = _add_figures(start.diagnostics, joint, camera, inflation)
+    J = joint.to_extrinsics[camera]
+    scatter, constants = (J @ each @ J.T for each in joint.covariances)
+    cov, inflation = widen(scatter + constants, jackknife_scatter(moves), n_placements)
+    figures = _add_figures(start.diagnostics, joint, inflation)
+    figures = with_parts(figures, scatter, constants)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
-    return replace(estimate, method="ml", turns=_turns(joint, camera), laser_angles=laser_angles(joint))
-
-
-def with_profile(
-    estimate: CalibrationEstimate, joint: JointEstimate, board: Board, settings: EstimateSettings
-) -> CalibrationEstimate:
-    """Add the effects of the errors of lens and board to the estimate of one camera."""
-    if settings.tolerances is None:
-        return estimate
-    sensitivities = _sensitivities(
-        list(estimate.observations.values()),
-        board,
-        settings.tolerances,
-        settings.lens,
-        partial(_moves_of_joint, joint),
-        {"plate_size": _moves_by_plate(joint, estimate, board)},
+    return replace(
+        estimate,
+        method="ml",
+        sensitivities=tuple(Sensitivity(name, 1.0, (J @ moves).T) for name, moves in joint.moves.items()),
+        turns=_turns(joint, camera),
+        laser_angles=laser_angles(joint),
+        lens=lens,
+        cov_with_lens=joint.cov_with_lens(camera),
+        joint=(joint, camera),
     )
-    return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
 
 
 def _turns(joint: JointEstimate, camera: int = 0) -> Array:
@@ -285,11 +278,11 @@ def laser_angles(joint: JointEstimate) -> dict[str, float]:
     return sizes
 
 
-def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
-    """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate."""
-    levels, state, J = joint.levels, joint.state, joint.to_extrinsics[camera]
+def _add_figures(start: Diagnostics, joint: JointEstimate, inflation: float) -> Diagnostics:
+    """Replace the start's constant errors and noise levels by those of a joint estimate."""
+    levels, state = joint.levels, joint.state
     shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
-    figures = replace(
+    return replace(
         start,
         covariance_inflation=inflation,
         edge_shift_m=shifts["d_0"],
@@ -300,44 +293,12 @@ def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflatio
         range_offset_m=float(np.mean(state.lasers[0])),
         laser_spread_m=float(np.std(state.lasers[0])),
         lens_vertical_m_per_rad=float(state.fields[1]),
-        camera_scale=1.0 - float(state.scale[camera]),
+        camera_scale=1.0 - state.squares,
         noise_range_m=levels.range_m,
         noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
         noise_spin_deg=float(np.degrees(levels.spin_rad)),
         noise_depth_m=levels.depth_m,
         noise_across_m=levels.across_m,
-    )
-    scatter, constants = joint.covariances
-    return with_parts(figures, J @ scatter @ J.T, J @ constants @ J.T)
-
-
-def _moves_of_joint(joint: JointEstimate, moves: Array) -> Array:
-    """Compute how far moves of boards' poses in images (n, F, 6) move the extrinsics of a camera: (n, 6)."""
-    terms, own_steps, G = joint.terms, joint.reduced.own_steps, joint.state.layout.z.size
-    # The gradients by [y, z] move by J^T C^-1 times how far the images' poses do.
-    images, rows, place = terms.images[0], terms.image_rows[0], joint.state.layout.image_row(0)[:-1]
-    weighted = -np.linalg.solve(images.total_cov(joint.levels), np.moveaxis(moves, 0, -1))
-    gradients = np.zeros((len(terms.trust), OWN.size + G, len(moves)))
-    gradients[images.capture[:, None], place] = np.swapaxes(rows[:, :, :-1], 1, 2) @ weighted
-    gradients *= terms.trust[:, None, None]
-    by_own, by_common = gradients[:, : OWN.size], gradients[:, OWN.size :]
-    changes = np.sum(by_common - np.swapaxes(own_steps[:, :, :G], 1, 2) @ by_own, axis=0)
-    return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes)).T)
-
-
-def _moves_by_plate(joint: JointEstimate, estimate: CalibrationEstimate, board: Board) -> Array:
-    """Compute how far width and height of the plate move one camera's extrinsics: (2, 6) per m."""
-    terms, changes = joint.terms, []
-    lidars = [observation.lidar for observation in estimate.observations.values()]
-    for side in ("width_m", "height_m"):
-        assumed = replace(board, **{side: getattr(board, side) + _STEP_M})
-        scans = stack_scans([interior(lidar, assumed) for lidar in lidars], assumed)
-        moved = assemble(
-            linearise(scans, terms.images, assumed, joint.state, terms.trust), joint.levels, joint.priors
-        )
-        changes.append((moved.cost.gradients - joint.cost.gradients).sum(axis=0) / _STEP_M)
-    return np.asarray(
-        -(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, np.transpose(changes))).T
     )
 
 

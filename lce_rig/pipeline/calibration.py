@@ -27,13 +27,12 @@ from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, relative_pose, tangent_sizes
+from lce_rig.core.geometry import relative_pose, tangent_sizes
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.export.extrinsics import Reference
-from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
@@ -83,11 +82,6 @@ class _Solved:
     @property
     def lidar(self) -> str:
         return self.pairs[0].lidar
-
-    @property
-    def cov_lens(self) -> Array:
-        """The part (6, 6) of the covariance from the lens."""
-        return summed_covariance([e for e in self.estimate.sensitivities if e.source == "intrinsics"])
 
     @property
     def is_still(self) -> bool:
@@ -431,10 +425,7 @@ def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraP
     T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
     if own.together is not None and own.together is other.together:
-        joint = own.together.covariance_of(own.camera, other.camera)
-        joint[:6, :6] += own.cov_lens
-        joint[6:, 6:] += other.cov_lens
-        cov = np.asarray(J @ joint @ J.T)
+        cov = np.asarray(J @ own.together.covariance_of(own.camera, other.camera) @ J.T)
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart.tangent)
     return OtherCamera(
         camera=other.camera,

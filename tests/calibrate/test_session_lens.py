@@ -94,7 +94,8 @@ def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
     lens = estimate.lens
     (by_lens,) = (each for each in estimate.sensitivities if each.source == "intrinsics")
     k = int(np.argmax(np.linalg.norm(by_lens.moves, axis=1)))
-    poses = lens.moves(list(estimate.observations.values()))[k]
+    poses, _, turns = lens.errors([o.image for o in estimate.observations.values()])
+    poses = poses[:, :, k]
     moved = [
         replace(o, image=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
         for o, move in zip(estimate.observations.values(), poses, strict=True)
@@ -102,7 +103,7 @@ def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
     again = fit_extrinsic(moved, BOARD, replace(SETTINGS, method=method))
     still = fit_extrinsic(list(estimate.observations.values()), BOARD, replace(SETTINGS, method=method))
     change = difference(again.T_cam_lidar, still.T_cam_lidar)
-    matrix = by_lens.moves[k] - np.append(np.zeros(3), lens.turns[k])
+    matrix = by_lens.moves[k] - np.append(np.zeros(3), turns[:, k])
     np.testing.assert_allclose(change, matrix, atol=0.15 * np.linalg.norm(matrix))
 
 

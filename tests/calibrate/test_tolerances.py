@@ -52,7 +52,9 @@ def with_errors(lens, errors):
 
 
 def moves_of(estimate, source):
-    return next(each.moves for each in estimate.sensitivities if each.source == source)
+    """Moves (n, 6) of a result by an error of the profile, per unit."""
+    found = next(each for each in estimate.sensitivities if each.source == source)
+    return found.sigma * found.moves / KNOWN.sigma(source)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
-from lce_rig.calibrate.likelihood.layout import State
+from lce_rig.calibrate.likelihood.layout import Indices, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, evidence, linearise
-from lce_rig.calibrate.likelihood.rays import interior, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
+from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import LidarBoard, Observation
@@ -38,6 +39,8 @@ _BELOW, _ABOVE = -4.6, 3.0
 _HUBER, _FARTHEST = 1.5, 1e6
 # Plain steps before any are mixed, and how many are.
 _PLAIN, _MIXED = 3, 5
+# Errors of lens and board that `Priors.held` holds.
+_HELD = ("pattern_offset", "intrinsics")
 # A mixed step is at most so many times as long as the plain one.
 _LONGEST = 5.0
 
@@ -51,12 +54,14 @@ class JointEstimate:
         levels: of the noise.
         priors: of the constants.
         placement: (F,) number of the placement that each capture shows; each its own without cameras.
+        captures: (F,) their names, sorted.
     """
 
     terms: Terms
     levels: Levels
     priors: Priors
     placement: NDArray[np.intp]
+    captures: tuple[str, ...]
 
     @property
     def state(self) -> State:
@@ -66,7 +71,7 @@ class JointEstimate:
     @cached_property
     def reduced(self) -> Reduced:
         """The normal equations."""
-        return assemble(self.terms, self.levels, self.priors)
+        return assemble(self.terms, self.levels, self.priors.held)
 
     @cached_property
     def cost(self) -> Quadratics:
@@ -75,29 +80,67 @@ class JointEstimate:
 
     @cached_property
     def covariances(self) -> tuple[Array, Array]:
-        """Parts of the covariance of z (G, G): what differs between sessions, and that of constant errors.
+        """Parts (G, G) of the covariance of z: what differs between sessions, and errors of the LiDAR.
 
-        With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+        With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + sum_i H^-1 P_i H^-1, with the
+        priors P_i of each kind of constant error. Those of lens and board are in `moves`.
         """
-        inverse, claimed, scales = self.cost.covariance(), self.cost.prior.copy(), self.state.layout.scales
-        if not self.priors.scale_is_claimed:
-            claimed[scales, scales] = 0.0
-        return inverse @ self.cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
+        inverse, prior = self.cost.covariance(), self.cost.prior.copy()
+        for at, _ in self._profiled.values():
+            prior[at] = 0.0
+        return inverse @ self.cost.hessians.sum(axis=0) @ inverse, inverse @ prior @ inverse
+
+    @cached_property
+    def moves(self) -> dict[str, Array]:
+        """Changes (G, n) of z by n independent errors of lens and board, of one standard deviation each.
+
+        An error of the profile moves z by H^-1 P_i for each unit. Unknowns c that are held move the others by
+        -H^-1 sum_k H_k,c.
+        """
+        inverse, data, found = self.cost.covariance(), self.cost.hessians.sum(axis=0), {}
+        for name, (at, sigma) in self._profiled.items():
+            if name in _HELD:
+                moves = -inverse @ data[:, at]
+                moves[at] = np.eye(len(at))
+            else:
+                moves = inverse @ self.cost.prior[:, at]
+            found[name] = sigma * moves
+        return found
+
+    @property
+    def _profiled(self) -> dict[str, tuple[Indices, float]]:
+        """By error of lens and board, its places in z and its standard deviation."""
+        layout, priors = self.state.layout, self.priors
+        found = {
+            "plate_size": (layout.plate, priors.plate_m),
+            "board_bow": (layout.z.of(["bow"]), priors.bow_m),
+        }
+        if layout.n_cameras:
+            optics = np.concatenate([layout.optics(c) for c in range(layout.n_cameras)])
+            found["square_size"] = layout.z.of(["squares"]), priors.squares
+            found["pattern_offset"] = layout.z.of(["pattern"]), priors.pattern_m
+            found["intrinsics"] = optics, priors.optics
+        return found
 
     @cached_property
     def cov_z(self) -> Array:
-        """Their sum (G, G)."""
-        return np.asarray(sum(self.covariances))
+        """(G, G) of z."""
+        return np.asarray(sum(self.covariances) + sum(m @ m.T for m in self.moves.values()))
 
     @cached_property
     def to_extrinsics(self) -> Array:
         """(C, 6, G) derivative of each camera's extrinsics, as reported, by z."""
-        return extrinsics_by_unknowns(self.state)
+        return extrinsics_by_unknowns(self.terms)
 
     @property
     def T_cam_lidar(self) -> Array:
         """(C, 4, 4) as reported."""
         return perturb(self.state.T_cam_lidar, self.to_extrinsics @ self.state.z)
+
+    def cov_with_lens(self, camera: int) -> Array:
+        """Compute the cross-covariance (6, P) of a camera's extrinsics and its intrinsics."""
+        optics, of_lens = self.state.layout.optics(camera), self.terms.images[camera].of_lens
+        return np.asarray(self.to_extrinsics[camera] @ self.cov_z[:, optics] @ of_lens)
 
     @property
     def cov(self) -> Array:
@@ -113,6 +156,7 @@ def maximise_likelihood(
     priors: Priors | None = None,
     usual: Levels | None = None,
     pose_ratios: Sequence[Mapping[str, float]] | None = None,
+    lenses: Sequence[SessionLens | None] | None = None,
 ) -> JointEstimate:
     """Estimate extrinsics of C cameras; captures of the same name share their scan and the board's pose.
 
@@ -120,24 +164,47 @@ def maximise_likelihood(
         cameras: observations of each.
         board: the board.
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
-        priors: of the constant errors; a scale that contradicts its own is freed.
+        priors: of the constant errors.
         usual: typical noise levels.
         pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
+        lenses: of each camera, whose errors are unknowns; None for lenses that are exact.
     """
-    by_name = {o.capture: (o, T) for camera, T in zip(cameras, T_cam_lidar, strict=True) for o in camera}
-    order = {name: k for k, name in enumerate(sorted(by_name))}
-    scans = stack_scans([interior(by_name[name][0].lidar, board) for name in order], board)
+    names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
+    by_name = {
+        o.capture: invert(T) @ o.image.T_cam_board
+        for camera, T in zip(cameras, T_cam_lidar, strict=True)
+        for o in camera
+    }
+    T_lidar_board = np.array([by_name[name] for name in names])
+    n_optics = [each.turns.shape[1] for each in images]
+    state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings), n_optics)
+    placement = group_poses(T_lidar_board)
+    terms = linearise(scans, images, board, state, weigh_placements(placement, images))
+    return _maximise(terms, priors or Priors(), usual or Levels(), placement, names)
+
+
+def stack_captures(
+    cameras: Sequence[Sequence[Observation]],
+    board: Board,
+    lenses: Sequence[SessionLens | None],
+    pose_ratios: Sequence[Mapping[str, float]] | None,
+) -> tuple[tuple[str, ...], StackedScans, list[StackedImages]]:
+    """Stack the captures of all cameras, sorted by name; arguments as of `maximise_likelihood`."""
+    lidars = {o.capture: o.lidar for camera in cameras for o in camera}
+    order = {name: k for k, name in enumerate(sorted(lidars))}
+    scans = stack_scans([interior(lidars[name], board) for name in order], board)
     images = [
-        stack_images(np.array([order[o.capture] for o in camera]), [o.image for o in camera])
-        for camera in cameras
+        stack_images(
+            np.array([order[o.capture] for o in camera]),
+            [o.image for o in camera],
+            board.pattern_offset_m,
+            lens,
+        )
+        for camera, lens in zip(cameras, lenses, strict=True)
     ]
     if pose_ratios is not None:
         images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]
-    T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (by_name[name] for name in order)])
-    state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings))
-    placement = group_poses(T_lidar_board)
-    terms = linearise(scans, images, board, state, _once(placement, images))
-    return _maximise(terms, priors or Priors(), usual or Levels(), placement)
+    return tuple(order), scans, images
 
 
 def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual: Levels) -> JointEstimate:
@@ -151,26 +218,27 @@ def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual
     """
     scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
     T_lidar_board = np.array([lidar.T_lidar_board for lidar in lidars])
-    state = State.without_errors(np.zeros((0, 4, 4)), T_lidar_board, len(scans.rings))
-    return _maximise(linearise(scans, (), board, state), priors, usual, np.arange(len(lidars)))
+    state = State.without_errors(np.zeros((0, 4, 4)), T_lidar_board, len(scans.rings), ())
+    return _maximise(linearise(scans, (), board, state), priors, usual, np.arange(len(lidars)), ())
 
 
-def _maximise(terms: Terms, priors: Priors, usual: Levels, placement: NDArray[np.intp]) -> JointEstimate:
+def _maximise(
+    terms: Terms, priors: Priors, usual: Levels, placement: NDArray[np.intp], captures: tuple[str, ...]
+) -> JointEstimate:
     """Alternate between steps towards the optimum and fits of the noise levels.
 
     Captures, whose placements (F,) are given, are weighed by how they disagree on the extrinsics.
     """
+    held = priors.held
     now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     for blur_rad in _BLURS_RAD:
-        terms = settle(terms, now.blurred(blur_rad), priors, _STEPS, _NEAR)
-    for k, n_rounds in enumerate(_LEVEL_ROUNDS):
-        terms = settle(terms, now, priors, _STEPS, _NEAR)
-        if k == len(_LEVEL_ROUNDS) - 1:
-            priors = priors.freed(terms.state.scale)
-        now = fit_levels(terms, now, usual, priors, n_rounds)
+        terms = settle(terms, now.blurred(blur_rad), held, _STEPS, _NEAR)
+    for n_rounds in _LEVEL_ROUNDS:
+        terms = settle(terms, now, held, _STEPS, _NEAR)
+        now = fit_levels(terms, now, usual, held, n_rounds)
         if terms.images:
-            terms = replace(terms, trust=trust_captures(terms, now, priors, placement))
-    return JointEstimate(settle(terms, now, priors, _LAST_STEPS, _SETTLED), now, priors, placement)
+            terms = replace(terms, trust=trust_captures(terms, now, held, placement))
+    return JointEstimate(settle(terms, now, held, _LAST_STEPS, _SETTLED), now, priors, placement, captures)
 
 
 def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
@@ -209,7 +277,14 @@ def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: fl
     return terms
 
 
-def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rounds: int) -> Levels:
+def fit_levels(
+    terms: Terms,
+    start: Levels,
+    usual: Levels,
+    priors: Priors,
+    n_rounds: int,
+    names: Sequence[str] = tuple(LOG_SIGMA),
+) -> Levels:
     """Find the levels that minimise -2 ln p(data | levels) - 2 ln p(levels).
 
     Args:
@@ -218,10 +293,11 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
         usual: centre of their prior; lasers without offsets there have none.
         priors: of the constants.
         n_rounds: of the search, at most.
+        names: of the levels to find; others are the usual ones.
     """
     from scipy.optimize import minimize
 
-    names = [name for name in LOG_SIGMA if name != "laser_m" or usual.laser_m > NO_LASER_M]
+    names = [name for name in names if name != "laser_m" or usual.laser_m > NO_LASER_M]
     sigma = np.array([LOG_SIGMA[name] for name in names])
     middle = np.log([getattr(usual, name) for name in names])
     # Thousands of ranges and a few captures determine one level each: without a scale, the search zigzags.
@@ -281,9 +357,9 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     References:
         Huber, "Robust Statistics", 1981.
     """
-    once = _once(placement, terms.images)
+    once = weigh_placements(placement, terms.images)
     cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
-    J = np.concatenate(extrinsics_by_unknowns(terms.state))
+    J = np.concatenate(extrinsics_by_unknowns(terms))
     H, of_placement = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
     without = symmetric_inverse(H - of_placement)
     moves = (without @ (cost.groups @ cost.gradients)[..., None])[..., 0] @ J.T
@@ -295,7 +371,7 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     return np.asarray(once * (_HUBER / np.clip(z, _HUBER, _FARTHEST))[placement])
 
 
-def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
+def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
     """Weigh captures (F,) so that those of one placement, whose errors are the same, count as one.
 
     Where cameras saw a placement in different numbers of captures, those that few of them saw count more.
@@ -307,17 +383,19 @@ def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array
     return 1 / fewest
 
 
-def extrinsics_by_unknowns(state: State) -> Array:
+def extrinsics_by_unknowns(terms: Terms) -> Array:
     """Differentiate the cameras' reported extrinsics by the unknowns z: (C, 6, G).
 
     Straight ahead of the camera, a lens beside the axis equals a shift of the whole LiDAR. That shift is part
-    of the extrinsics, which apply to points as the driver gives them.
+    of the extrinsics, which apply to points as the driver gives them. They are used with the intrinsics of
+    the same result: an error of these that projects like a rotation of the camera is part of them, too.
     """
-    layout = state.layout
+    state, layout = terms.state, terms.state.layout
     J = np.zeros((layout.n_cameras, 6, layout.z.size))
-    for c, T_cam_lidar in enumerate(state.T_cam_lidar):
+    for c, (T_cam_lidar, images) in enumerate(zip(state.T_cam_lidar, terms.images, strict=True)):
         J[c][:, layout.camera(c)] = np.eye(6)
         # The third row of R is the camera's line of sight in frame lidar.
         beside = lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
         J[c, :3, layout.z["lens"].start] = T_cam_lidar[:3, :3] @ beside
+        J[c, 3:, layout.optics(c)] = images.turns.T
     return J

@@ -3,17 +3,20 @@
 The unknowns of each capture are y = [pose, own_shift]: the tangent of T_lidar_board, and what the capture
 adds to the shift of ring ends. All captures share
 
-    z = [camera 0, scale 0, camera 1, scale 1, ..., range, azimuth, elevation, lens, bow, shifts]
+    z = [camera 0, ..., range, azimuth, elevation, lens, bow, stretch, contrast, shifts, squares, pattern,
+         optics 0, ...]
 
-with camera the tangent of T_cam_lidar and scale the relative error of the camera's distances, positive for
-too short; range, azimuth and elevation the errors of each laser. A row of the normal equations is
-[y, z, residual].
+with camera the tangent of T_cam_lidar; range, azimuth and elevation the errors of each laser; lens, bow,
+stretch and contrast the displacements of `rays`; squares the relative error of the squares' size, positive
+for squares that are larger than the profile's; pattern the displacement of the pattern's centre on the plate,
+to the right and up, m; optics the errors of a camera's lens, in independent directions of unit variance. A
+row of the normal equations is [y, z, residual].
 
 A further constant error is an entry here, its derivative in the rows of `rays` or `images`, and a standard
 deviation in `levels.Priors`.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,10 +27,16 @@ from lce_rig.core.geometry import Array, perturb
 Indices = NDArray[np.intp]
 LASER = ("range", "azimuth", "elevation")
 """Constant errors of each laser, in m and rad."""
-SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards", "beam's width", "beam's height")
-"""Unknowns of ring ends: equation (3) of `rays`, the plate's shape, the displacement of ring ends, and
-relative errors of a beam's two widths."""
-_FIELDS = {"lens": 2, "bow": 2}
+_OF_WIDTH = ("d_0", "c", "d_1", "d_2", "d_3")
+_OF_ENDS = ("along azimuth", "upwards", "beam's width", "beam's height")
+SHIFTS = (*_OF_WIDTH, "width", "height", *_OF_ENDS)
+"""Unknowns of ring ends: equation (3) of `rays`, errors of the plate's width and height, the displacement of
+ring ends, and relative errors of a beam's two widths."""
+PLATE = slice(len(_OF_WIDTH), len(_OF_WIDTH) + 2)
+"""Places of the plate's width and height in `SHIFTS`."""
+_FIELDS = {"lens": 2, "bow": 2, "stretch": 1, "contrast": 1}
+BOARD = {"squares": 1, "pattern": 2}
+"""Errors of the print, in images."""
 _OWN = {"pose": 6, "own_shift": 1}
 
 
@@ -64,30 +73,36 @@ RING = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "residual": 1})
 """Row of a return."""
 END = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "shifts": len(SHIFTS), "own_shift": 1, "residual": 1})
 """Row of a ring end."""
-IMAGE = Columns({"camera": 6, "pose": 6, "scale": 1, "residual": 1})
-"""Row of a board's pose in an image."""
 OWN = Columns(_OWN)
 """Unknowns y of a capture."""
+
+
+def image_columns(n_optics: int) -> Columns:
+    """Name the columns of the row of a board's pose in an image of a camera with n unknowns of its lens."""
+    return Columns({"camera": 6, "pose": 6, **BOARD, "optics": n_optics, "residual": 1})
 
 
 class Layout:
     """Places of the unknowns of C cameras and L rings.
 
     Args:
-        n_cameras: C.
+        n_optics: number of unknowns of each lens.
         n_rings: L.
+        lens_of: of which lens each camera's images are; of its own by default. A camera that moved is two.
 
     Attributes:
         z: places in the vector of the unknowns that captures share.
         row: places in a row [y, z, residual].
     """
 
-    def __init__(self, n_cameras: int, n_rings: int) -> None:
-        self.n_cameras, self.n_rings = n_cameras, n_rings
-        common: dict[str, int] = {}
-        for c in range(n_cameras):
-            common |= {f"camera {c}": 6, f"scale {c}": 1}
+    def __init__(self, n_optics: Sequence[int], n_rings: int, lens_of: Sequence[int] | None = None) -> None:
+        self._lens_of = range(len(n_optics)) if lens_of is None else lens_of
+        self.n_cameras, self.n_rings = len(self._lens_of), n_rings
+        common = {f"camera {c}": 6 for c in range(self.n_cameras)}
         common |= {**dict.fromkeys(LASER, n_rings), **_FIELDS, "shifts": len(SHIFTS)}
+        if n_optics:
+            common |= BOARD
+        common |= {f"optics {c}": n for c, n in enumerate(n_optics)}
         self.z = Columns(common)
         self.row = Columns({**_OWN, **common, "residual": 1})
 
@@ -100,10 +115,18 @@ class Layout:
         """Places in z of all cameras' tangents (C, 6)."""
         return np.array([self.camera(c) for c in range(self.n_cameras)], dtype=np.intp).reshape(-1, 6)
 
+    def errors(self, c: int) -> Indices:
+        """Places in z of what moves the poses in a camera's images: print and lens."""
+        return self.z.of([*BOARD, f"optics {self._lens_of[c]}"])
+
+    def optics(self, c: int) -> Indices:
+        """Places in z of the errors of a camera's lens."""
+        return self.z.of([f"optics {self._lens_of[c]}"])
+
     @property
-    def scales(self) -> Indices:
-        """Places in z of the cameras' scales (C,)."""
-        return self.z.of([f"scale {c}" for c in range(self.n_cameras)])
+    def plate(self) -> Indices:
+        """Places in z of the errors of the plate's width and height (2,)."""
+        return self.z.of(["shifts"])[PLATE]
 
     @property
     def lasers(self) -> Indices:
@@ -112,12 +135,12 @@ class Layout:
 
     @property
     def fields(self) -> Indices:
-        """Places in z of lens and bow (4,)."""
+        """Places in z of the displacements of points (6,)."""
         return self.z.of(_FIELDS)
 
     def image_row(self, c: int) -> Indices:
-        """Places in a row of the columns of `IMAGE` for a camera."""
-        return self.row.of(f"{name} {c}" if name in ("camera", "scale") else name for name in IMAGE)
+        """Places in a row of the columns of `image_columns` for a camera."""
+        return self.row.of([f"camera {c}", "pose", *BOARD, f"optics {self._lens_of[c]}", "residual"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +162,11 @@ class State:
     z: Array
 
     @classmethod
-    def without_errors(cls, T_cam_lidar: Array, T_lidar_board: Array, n_rings: int) -> "State":
-        """Start with constant errors of zero."""
-        layout = Layout(len(T_cam_lidar), n_rings)
+    def without_errors(
+        cls, T_cam_lidar: Array, T_lidar_board: Array, n_rings: int, n_optics: Sequence[int]
+    ) -> "State":
+        """Start with constant errors of zero; `n_optics` as of `Layout`."""
+        layout = Layout(n_optics, n_rings)
         return cls(layout, T_cam_lidar, T_lidar_board, np.zeros(len(T_lidar_board)), np.zeros(layout.z.size))
 
     @property
@@ -151,18 +176,34 @@ class State:
 
     @property
     def fields(self) -> Array:
-        """(4,) displacement of the LiDAR's lens, and bow of the plate along its width and height."""
+        """(6,) displacement of the LiDAR's lens, bow of the plate along its width and height, relative error
+        of ranges, and their error by the print."""
         return self.z[self.layout.fields]
 
     @property
     def shifts(self) -> Array:
-        """(10,) of ring ends, `SHIFTS`."""
+        """(11,) of ring ends, `SHIFTS`."""
         return self.z[self.layout.z["shifts"]]
 
     @property
-    def scale(self) -> Array:
-        """(C,) relative error of each camera's distances, positive for too short."""
-        return self.z[self.layout.scales]
+    def squares(self) -> float:
+        """Relative error of the squares' size, positive for squares that are larger than the profile's."""
+        return float(self.z[self.layout.z["squares"]][0])
+
+    def common_to(self, layout: Layout, rings: NDArray[np.int16], other_rings: NDArray[np.int16]) -> Array:
+        """Copy the values of constant errors of LiDAR and board into another layout: z (G,).
+
+        Args:
+            layout: the other one.
+            rings: (L,) ring numbers of this one.
+            other_rings: of the other one.
+        """
+        z = np.zeros(layout.z.size)
+        _, here, there = np.intersect1d(rings, other_rings, return_indices=True)
+        z[layout.lasers[:, there]] = self.z[self.layout.lasers[:, here]]
+        for name in (*_FIELDS, "shifts", *BOARD):
+            z[layout.z[name]] = self.z[self.layout.z[name]]
+        return z
 
     def moved(self, z: Array, y: Array) -> "State":
         """Apply a step z (G,) and y (F, 7)."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from lce_rig.calibrate.likelihood.end_density import edge_products
 from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
-from lce_rig.calibrate.likelihood.layout import END, LASER, OWN, RING, Columns, Indices, Layout, State
+from lce_rig.calibrate.likelihood.layout import BOARD, END, LASER, OWN, RING, Columns, Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels, Priors
 from lce_rig.calibrate.likelihood.rays import (
     EdgeRows,
@@ -32,6 +32,7 @@ _LOG_STEP = 1e-4
 # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
 # extrinsics. This much of it is left.
 _MEAN_FLOOR = 1e-6
+_OF_PROFILE = frozenset(BOARD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,8 @@ def linearise(
         sum_ranges(scans, state),
         edge_rows(scans, board, state),
         tuple(
-            image_rows(of_camera, T, state.T_lidar_board, scale)
-            for of_camera, T, scale in zip(images, state.T_cam_lidar, state.scale.tolist(), strict=True)
+            image_rows(of_camera, T, state.T_lidar_board, state.z[state.layout.errors(c)])
+            for c, (of_camera, T) in enumerate(zip(images, state.T_cam_lidar, strict=True))
         ),
     )
 
@@ -162,12 +163,14 @@ class Reduced:
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
+        minus_2_log_likelihood: -2 ln p(data, unknowns | levels) at the optimum, up to a constant.
     """
 
     cost: Quadratics
     own_steps: Array
     of_own: Array
     minus_2_log_evidence: float
+    minus_2_log_likelihood: float
 
     @cached_property
     def gradient(self) -> Array:
@@ -280,8 +283,9 @@ def _reduce(terms: Terms, parts: Sequence[Products], levels: Levels, priors: Pri
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
     least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
+    likelihood = float(least + log_volume)
     log_volume += float(trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
-    return Reduced(summed, np.asarray(steps), of_own, float(least + log_volume + prior_volume))
+    return Reduced(summed, np.asarray(steps), of_own, float(least + log_volume + prior_volume), likelihood)
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
@@ -292,8 +296,12 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
     layout, known = terms.state.layout, priors.known
     L = layout.n_rings
     prior, mean = np.zeros((layout.z.size, layout.z.size)), np.zeros(layout.z.size)
-    prior[layout.scales, layout.scales] = 1 / np.square(priors.scale)
-    sigmas, log_volume = priors.independent, 0.0
+    sigmas, log_volume = priors.of_scans, 0.0
+    if layout.n_cameras:
+        sigmas |= priors.of_print
+    for name in layout.z:
+        if name.startswith("optics"):
+            sigmas[name] = np.full(len(layout.z.of([name])), priors.optics)
     if known is not None:
         mean[layout.z["lens"]], sigmas["lens"] = known.lens, known.lens_sigma
         # Rings that are known: their indices among those seen, and among those known.
@@ -301,6 +309,9 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
     for name, sigma in sigmas.items():
         at = layout.z.of([name])
         prior[at, at] = sigma**-2.0
+    for at in (layout.z.of(sigmas.keys() & _OF_PROFILE), layout.plate):
+        # Weights of Student's distribution at the present values.
+        prior[at, at] /= 1 + prior[at, at] * terms.state.z[at] ** 2 / priors.freedoms
     of_lasers = ((levels.laser_m, priors.offset_m), (priors.azimuth_rad, 0.0), (priors.elevation_rad, 0.0))
     for k, (at, (each, common)) in enumerate(zip(layout.lasers, of_lasers, strict=True)):
         cov = each**2 * (np.eye(L) - 1 / L)

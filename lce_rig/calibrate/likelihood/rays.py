@@ -28,7 +28,7 @@ and r the range,
     d = d_0 + c r + d_2 + d_3 q    where it is so near that both echoes blend into one                   (3)
 
 Recordings show d_1 near -17 mm, simulation -15 mm. A plate that is larger than its drawing shifts all edges
-alike and is part of d_0; by the shape p its upright edges lie farther out, the others as much farther in.
+alike by half as much; width and height have an unknown each.
 What is left, the same for all ring ends (a beam that is not symmetric, a clock of the rotor), is a small
 displacement of ring ends against the returns between them, along azimuth and upwards. Without rings, beams
 may be ten times as wide one way as the other: what half a beam's width adds along each edge's normal is
@@ -46,6 +46,11 @@ Plate. No plate is flat. With n the board's normal, and h_w and h_h the height o
 along its width or its height (`bow_heights`), a point p of the plate stands for the point of the plane at
 
     p - (bow_w h_w + bow_h h_h) n                                                                        (5)
+
+Ranges that are too long by a fraction, the stretch, and by another amount on the dark parts of the print than
+on the white ones, half the contrast either way, stand for the points
+
+    p - stretch p - contrast / 2 p / |p| on dark parts, + on white ones                                  (6)
 """
 
 from collections.abc import Sequence
@@ -67,6 +72,7 @@ from lce_rig.calibrate.plane_and_ends import (
 )
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
+from lce_rig.core.pattern import is_dark
 from lce_rig.core.results import LidarBoard
 
 # Typical noise of a cell's mean without rings.
@@ -87,13 +93,13 @@ class StackedScans:
         capture, ring: (N,) of each return; `ring` is an index into `rings`.
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
-        fields: (N, 3, 4) displacement by (4) and (5), per unit of lens (2) and bow (2).
+        fields: (N, 3, 6) displacement by (4) to (6), per unit of lens (2), bow (2), stretch and contrast.
         weight: (F,) inverse of each capture's noise of a return, relative to others; 1 with rings. Without, a
             "return" is the mean over a cell of the plate, whose noise was measured.
         end_capture, end_ring: (M,) of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
-        end_fields: (M, 3, 4) as `fields`.
+        end_fields: (M, 3, 6) as `fields`.
         end_background: (M, 3) what is behind it, `describe_background`.
         end_beam: (M, 2) half the beam's width along the edge's normal, by the beam's two axes; 0 with rings.
     """
@@ -174,11 +180,16 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
 
 
 def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:
-    """Compute the displacements (4) and (5) of points (N, 3) on boards (N, 4, 4), frame lidar: (N, 3, 4)."""
+    """Compute the displacements (4) to (6) of points (N, 3) on boards (N, 4, 4), frame lidar: (N, 3, 6)."""
     R, t = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3]
-    height = bow_heights(np.einsum("nji,nj->ni", R, points - t), board)
-    by_bow = -R[:, :, 2, None] * height[:, None]
-    return np.concatenate([lens_fields(points), by_bow], axis=2)
+    on_board = np.einsum("nji,nj->ni", R, points - t)
+    by_bow = -R[:, :, 2, None] * bow_heights(on_board, board)[:, None]
+    side = np.where(is_dark(board, on_board[:, :2]), 0.5, -0.5)
+    by_print = -(side / np.linalg.norm(points, axis=1))[:, None] * points
+    # The stretch moves points along their rays by shares of the model's ranges (`sum_ranges`): those measured
+    # have noise, which it would explain.
+    none = np.zeros((len(points), 3, 1))
+    return np.concatenate([lens_fields(points), by_bow, none, by_print[..., None]], axis=2)
 
 
 def bow_heights(on_board: Array, board: Board) -> Array:
@@ -217,7 +228,7 @@ class RangeSums(NamedTuple):
     """Sums of v v^T by capture and ring, at given board poses.
 
     Attributes:
-        sums: (F, L, 14, 14) in columns of `RING`, weighted by capture.
+        sums: (F, L, 16, 16) in columns of `RING`, weighted by capture.
         n_returns: (F, L) how many.
     """
 
@@ -236,8 +247,9 @@ def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     v[:, RING["pose"]] = differentiate(across, r[:, None] * scans.rays - t)
     v[:, RING["range"]] = 1
     v[:, RING.span("azimuth", "elevation")] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
-    v[:, RING.span("lens", "bow")] = np.einsum("ni,nij->nj", across, scans.fields)
-    by_laser, by_fields = v[:, RING.span("range", "elevation")], v[:, RING.span("lens", "bow")]
+    v[:, RING.span("lens", "contrast")] = np.einsum("ni,nij->nj", across, scans.fields)
+    v[:, RING["stretch"]] = r[:, None]
+    by_laser, by_fields = v[:, RING.span("range", "elevation")], v[:, RING.span("lens", "contrast")]
     of_laser = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring])
     v[:, -1] = r + of_laser + by_fields @ state.fields - scans.range_m
     v *= scans.weight[scans.capture, None]
@@ -260,7 +272,7 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
     With weights w_i, sigma^2 I is diag(sigma^2 / w_i^2), and n the sum of their squares.
 
     Returns:
-        The weighted sums (F, L, 14, 14) and the logs (F, L) of the covariances' determinants.
+        The weighted sums (F, L, 16, 16) and the logs (F, L) of the covariances' determinants.
     """
     n = ranges.n_returns
     shared = ranges.sums[..., RING["range"].start, :]
@@ -276,7 +288,7 @@ class EdgeRows:
 
     Attributes:
         group: (M,) index of each end's pair of capture and ring, of F L in all; ascending.
-        rows: (M, 25) in columns of `END`, e in m.
+        rows: (M, 28) in columns of `END`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
@@ -324,11 +336,11 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     rows[:, END["pose"]] = -differentiate(sideways, here)
     by_angle = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
     rows[:, END.span("azimuth", "elevation")] = by_angle
-    rows[:, END.span("lens", "bow")] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    rows[:, END.span("lens", "contrast")] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
     # By the shifts of (3), the shape of the plate, and the displacement along azimuth and upwards.
     across = np.linalg.norm(sideways, axis=1, keepdims=True)
     of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
-    of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
+    of_plate = np.abs(outwards) / 2
     by_azimuth = np.sum(sideways * scans.end_fields[:, :, 0], axis=1)
     by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2], scans.end_beam])
     rows[:, END["shifts"]], rows[:, END["own_shift"]] = by_shifts, by_shifts[:, :1]

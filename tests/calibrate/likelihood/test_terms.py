@@ -8,7 +8,8 @@ from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.likelihood.images import image_rows, stack_images
-from lce_rig.calibrate.likelihood.layout import END, IMAGE, RING, SHIFTS, State
+from lce_rig.calibrate.likelihood.layout import BOARD as PRINT
+from lce_rig.calibrate.likelihood.layout import END, RING, SHIFTS, State, image_columns
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
 from lce_rig.calibrate.likelihood.model import assemble, evidence, linearise
 from lce_rig.calibrate.likelihood.rays import (
@@ -23,10 +24,11 @@ from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
+IMAGE = image_columns(0)
 
 
 def without_errors(scans, T_lidar_board):
-    return State.without_errors(T_FORWARD[None], T_lidar_board, len(scans.rings))
+    return State.without_errors(T_FORWARD[None], T_lidar_board, len(scans.rings), [0])
 
 
 def off(state, name, index, value):
@@ -146,7 +148,7 @@ def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, 
 
 
 def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board):
-    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0)
+    rows = image_rows(images, T_FORWARD, T_lidar_board, np.zeros(3))
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]
         by_camera = [
@@ -185,7 +187,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     F, z = len(terms.trust), terms.state.layout.z
     rows, noise = [], []
     by_camera = terms.image_rows[0]
-    names = {"camera": "camera 0", "scale": "scale 0"}
+    names = {"camera": "camera 0"} | {name: name for name in PRINT}
 
     def own_pose(k):
         return slice(z.size + 6 * k, z.size + 6 * k + 6)
@@ -206,7 +208,9 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
         turned = r[i] * turn_rays(scans.rays[i : i + 1])[0]
         angles = [z[name].start + scans.ring[i] for name in ("azimuth", "elevation")]
         own[0, angles] = -n @ turned / (n @ scans.rays[i])
-        own[0, z.of(["lens", "bow"])] = -n @ scans.fields[i] / (n @ scans.rays[i])
+        displaced = z.of(["lens", "bow", "stretch", "contrast"])
+        own[0, displaced] = -n @ scans.fields[i] / (n @ scans.rays[i])
+        own[0, z["stretch"]] = r[i]
         own[0, -1] = r[i] - scans.range_m[i]
         rows.append(own)
     same = scans.group[:, None] == scans.group[None]
@@ -237,8 +241,8 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
         lasers = block_diag(
             *(a**2 * about_mean + b**2 + 1e-12 * np.eye(L) for a, b in zip(own, common, strict=True))
         )
-        constants = np.square(np.concatenate(list(priors.independent.values())))
-        known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))
+        constants = np.concatenate([*priors.of_scans.values(), *priors.of_print.values()])
+        known = block_diag(np.linalg.inv(lasers), np.diag(constants**-2))
         A, e = rows[:, :-1], rows[:, -1]
         H, g = A.T @ np.linalg.solve(cov, A), A.T @ np.linalg.solve(cov, e)
         H[6:G, 6:G] += known

@@ -1,0 +1,166 @@
+"""The likelihood of one camera's captures under assumptions other than those of its estimate.
+
+It serves to judge an estimate. Every capture has full weight, and the images' errors begin at their usual
+levels: captures that contradict each other would lose weight, and widen the noise that judges them. No
+unknown is held, and priors have no tails.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.likelihood.fit import (
+    JointEstimate,
+    extrinsics_by_unknowns,
+    fit_levels,
+    settle,
+    stack_captures,
+    weigh_placements,
+)
+from lce_rig.calibrate.likelihood.images import StackedImages
+from lce_rig.calibrate.likelihood.layout import Layout, State
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, OF_IMAGES, Levels, Priors
+from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, linearise
+from lce_rig.calibrate.observations import group_poses
+from lce_rig.calibrate.session_lens import SessionLens
+from lce_rig.core.geometry import Array, exp_so3, invert, perturb, pose, rotation_angle
+from lce_rig.core.results import Observation
+
+# Steps of captures' own poses under given extrinsics, and of all unknowns; these end below so many standard
+# deviations.
+_OWN_STEPS, _STEPS, _SHORT = 4, 60, 0.3
+_LEVEL_ROUNDS = 8
+_TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((4, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """F captures of one camera under M mountings, settled.
+
+    Attributes:
+        terms: linearised at the optimum; the images of each mounting are those of a camera.
+        images: of all mountings.
+        levels: of the noise.
+        priors: of the constants.
+        captures: (F,) names, sorted.
+        mounting: (F,) number of the mounting that each capture shows.
+        T_lidar_board: (F, 4, 4) of the boards as the scans alone show them, or as the estimate has them.
+        is_further: (F,) whether the captures are not of the estimate.
+    """
+
+    terms: Terms
+    images: StackedImages
+    levels: Levels
+    priors: Priors
+    captures: tuple[str, ...]
+    mounting: NDArray[np.intp]
+    T_lidar_board: Array
+    is_further: NDArray[np.bool_]
+
+    @property
+    def state(self) -> State:
+        """All unknowns at the optimum."""
+        return self.terms.state
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The normal equations."""
+        return assemble(self.terms, self.levels, self.priors)
+
+    @property
+    def T_cam_lidar(self) -> Array:
+        """(M, 4, 4) extrinsics of each mounting, as they are used with the camera's intrinsics."""
+        return perturb(self.state.T_cam_lidar, extrinsics_by_unknowns(self.terms) @ self.state.z)
+
+    @cached_property
+    def deviance(self) -> float:
+        """-2 ln p(captures, levels of the images) at the optimum, up to a constant."""
+        off = [np.log(self.noise_ratio(name)) / LOG_SIGMA[name] for name in OF_IMAGES]
+        return self.reduced.minus_2_log_likelihood + float(np.sum(np.square(off)))
+
+    def noise_ratio(self, name: str) -> float:
+        """Return a level of the images' errors in units of the usual one."""
+        return float(getattr(self.levels, name) / getattr(Levels(), name))
+
+    def with_fitted_noise(self) -> "Hypothesis":
+        """Fit the levels of the images' errors."""
+        usual = replace(self.levels, **{name: getattr(Levels(), name) for name in OF_IMAGES})
+        fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
+        return self.under(levels=fitted)
+
+    def under(
+        self,
+        priors: Priors | None = None,
+        mounting: NDArray[np.intp] | None = None,
+        T_cam_lidar: Array | None = None,
+        levels: Levels | None = None,
+    ) -> "Hypothesis":
+        """Settle under other assumptions.
+
+        Args:
+            priors: of the constants; the present ones by default.
+            mounting: (F,) of the captures; the present one by default.
+            T_cam_lidar: (M, 4, 4) of each mounting, to start from.
+            levels: of the noise; the present ones by default.
+        """
+        priors, levels = priors or self.priors, levels or self.levels
+        old, terms = self.state, self.terms
+        if mounting is None or T_cam_lidar is None:
+            mounting = self.mounting
+        else:
+            shown = mounting[self.images.capture]
+            split = [self.images.select(shown == m) for m in range(len(T_cam_lidar))]
+            n_optics = self.images.turns.shape[1]
+            layout = Layout([n_optics], old.layout.n_rings, [0] * len(split))
+            z = old.common_to(layout, terms.scans.rings, terms.scans.rings)
+            z[layout.optics(0)] = old.z[old.layout.optics(0)]
+            # A wrong mounting has drawn boards away from where their scans show them.
+            is_new = ((mounting != self.mounting) & self.is_further)[:, None, None]
+            T_lidar_board = np.where(is_new, self.T_lidar_board, old.T_lidar_board)
+            state = State(layout, T_cam_lidar, T_lidar_board, old.own_shift_m, z)
+            terms = linearise(terms.scans, split, terms.board, state, terms.trust)
+        terms = settle(terms, levels, priors, _STEPS, _SHORT)
+        return replace(self, terms=terms, levels=levels, priors=priors, mounting=mounting)
+
+
+def at_full_weight(
+    joint: JointEstimate, observations: Sequence[Observation], lens: SessionLens | None, camera: int = 0
+) -> Hypothesis:
+    """State the assumptions of an estimate for the captures of one camera.
+
+    Args:
+        joint: the estimate.
+        observations: of the camera, which may be more than those that the estimate is of.
+        lens: of the camera; None where it is exact.
+        camera: its number.
+    """
+    board, T_cam_lidar = joint.terms.board, joint.state.T_cam_lidar[camera]
+    names, scans, (images,) = stack_captures([observations], board, [lens], None)
+    starts = {o.capture: (_nearest_turn(o, T_cam_lidar), 0.0) for o in observations}
+    settled = zip(joint.state.T_lidar_board, joint.state.own_shift_m.tolist(), strict=True)
+    starts |= dict(zip(joint.captures, settled, strict=True))
+    T_lidar_board = np.array([starts[name][0] for name in names])
+    own_shift_m = np.array([starts[name][1] for name in names])
+    layout = Layout([images.turns.shape[1]], len(scans.rings))
+    z = joint.state.common_to(layout, joint.terms.scans.rings, scans.rings)
+    state = State(layout, T_cam_lidar[None], T_lidar_board, own_shift_m, z)
+    trust = weigh_placements(group_poses(T_lidar_board), [images])
+    terms = linearise(scans, [images], board, state, trust)
+    levels = replace(joint.levels, **{name: getattr(Levels(), name) for name in OF_IMAGES})
+    priors = replace(joint.priors, freedoms=np.inf)
+    for _ in range(_OWN_STEPS):
+        own = -assemble(terms, levels, priors).own_steps[:, :, -1]
+        terms = linearise(scans, [images], board, terms.state.moved(np.zeros(layout.z.size), own), trust)
+    alike = np.zeros(len(names), dtype=np.intp)
+    is_further = np.array([name not in joint.captures for name in names])
+    return Hypothesis(terms, images, levels, priors, names, alike, T_lidar_board, is_further).under()
+
+
+def _nearest_turn(observation: Observation, T_cam_lidar: Array) -> Array:
+    """Choose of the plate's four turns the one in which the scan's pose is nearest to the image's."""
+    expected = invert(T_cam_lidar) @ observation.image.T_cam_board
+    turned = observation.lidar.T_lidar_board @ _TURNS
+    return np.asarray(turned[int(np.argmin(rotation_angle(turned[:, :3, :3], expected[:3, :3])))])
