@@ -55,6 +55,7 @@ class Scan:
         ring: (N,) int16, 0 = lowest elevation; `NO_RING` throughout without rings.
         offset_ns: (N,) int64 firing time after stamp_ns; None if the recording carries none.
         host_ns: arrival at the host; None if unknown.
+        range_offset_m: already subtracted from the ranges; 0 for a scan as recorded.
     """
 
     sensor: str
@@ -64,6 +65,27 @@ class Scan:
     ring: NDArray[np.int16]
     offset_ns: NDArray[np.int64] | None = None
     host_ns: int | None = None
+    range_offset_m: float = 0.0
+
+    def corrected(self, range_offset_m: float) -> "Scan":
+        """Subtract a constant from all ranges of a scan as recorded, along each ray from the origin.
+
+        A scan corrected by the same offset is returned unchanged, so that nothing is subtracted twice.
+        Returns not beyond the offset are dropped.
+
+        Args:
+            range_offset_m: positive where the driver's ranges are too long.
+        """
+        excess_m = range_offset_m - self.range_offset_m
+        if excess_m == 0:
+            return self
+        points = np.asarray(self.points, dtype=np.float64)
+        range_m = np.linalg.norm(points, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points = points * (1 - excess_m / range_m)[:, None]
+        moved = replace(self, points=points.astype(np.float32), range_offset_m=range_offset_m)
+        is_behind = range_m <= max(excess_m, 0.0)  # false for NaN
+        return moved.select(~is_behind) if is_behind.any() else moved
 
     def select(self, keep: NDArray[Any]) -> "Scan":
         """Keep the points of a mask or index (N,) or (M,)."""
