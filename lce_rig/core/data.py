@@ -7,6 +7,8 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.geometry import shortened
+
 MAX_TIME_NS = 1 << 62
 """No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
 NO_RING = -1
@@ -79,12 +81,10 @@ class Scan:
         excess_m = range_offset_m - self.range_offset_m
         if excess_m == 0:
             return self
-        points = np.asarray(self.points, dtype=np.float64)
-        range_m = np.linalg.norm(points, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            points = points * (1 - excess_m / range_m)[:, None]
-        moved = replace(self, points=points.astype(np.float32), range_offset_m=range_offset_m)
-        is_behind = range_m <= max(excess_m, 0.0)  # false for NaN
+        points = shortened(self.points, excess_m).astype(np.float32)
+        moved = replace(self, points=points, range_offset_m=range_offset_m)
+        # False for NaN.
+        is_behind = np.linalg.norm(self.points.astype(np.float64), axis=1) <= max(excess_m, 0.0)
         return moved.select(~is_behind) if is_behind.any() else moved
 
     def select(self, keep: NDArray[Any]) -> "Scan":
