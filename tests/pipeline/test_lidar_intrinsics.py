@@ -12,11 +12,14 @@ from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.measure_lidar import lidar_document, measure_lidar, save_lidar
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, Scenario, simulate
+from tests.shared import changed
 
 
-def seen(moved_m, offset_m=0.0):
+def seen(moved_m, offset_m=0.0, bias_sigma_m=0.008):
     """Detect boards that move along their normals between scan and image, by a LiDAR of that offset."""
-    captures = simulate(16, 1, Scenario(laser_bias_sigma_m=0.008, range_offset_m=offset_m), board=BOARD)
+    captures = simulate(
+        16, 1, Scenario(laser_bias_sigma_m=bias_sigma_m, range_offset_m=offset_m), board=BOARD
+    )
     rng = np.random.default_rng(3)
     lidars = {}
     for item in captures:
@@ -44,9 +47,7 @@ def test_boards_that_moved_between_image_and_scan_are_refused_with_an_action(tmp
 
 @pytest.mark.parametrize("known_m", [0.0, 0.02])
 def test_measure_lidar_all_ranges_long_saves_offset(tmp_path, known_m):
-    rig = lce.load_rig("rlfs")
-    lidar = rig.lidars["lidar"].model_copy(update={"range_offset_m": known_m})
-    rig = rig.model_copy(update={"lidars": {"lidar": lidar}})
+    rig = changed(lce.load_rig("rlfs"), lidars__lidar__range_offset_m=known_m)
     with lce.Session.create(tmp_path / "session", rig) as session:
         errors = measure_lidar([session], found=[seen(0.0, 0.06)])
         document = lidar_document(errors)
@@ -62,6 +63,17 @@ def test_measure_lidar_all_ranges_long_saves_offset(tmp_path, known_m):
     assert len(saved.intrinsics.lasers) == len(document["lasers"])
 
 
+def test_measure_lidar_like_lasers_saves_only_offset(tmp_path):
+    rig = changed(lce.load_rig("rlfs"), lidars__lidar__laser_bias_sigma_m=0.0005)
+    with lce.Session.create(tmp_path / "session", rig) as session:
+        errors = measure_lidar([session], found=[seen(0.0, 0.06, 0.0)])
+        save_lidar(session, None, errors, tmp_path / "new.yaml")
+    assert errors.offset_m == pytest.approx(0.06, abs=3 * errors.offset_sigma_m)
+    assert lidar_document(errors).keys() == {"n_captures", "range_offset_m", "range_offset_sigma_m"}
+    saved = load_rig(tmp_path / "new.yaml").lidars["lidar"]
+    assert saved.range_offset_m == pytest.approx(errors.offset_m, abs=1e-5) and saved.intrinsics is None
+
+
 def test_measure_lidar_moved_and_long_is_refused(tmp_path):
     session = lce.Session.create(tmp_path / "session", lce.load_rig("rlfs"))
     with pytest.raises(ResultRefusedError):
@@ -70,8 +82,7 @@ def test_measure_lidar_moved_and_long_is_refused(tmp_path):
 
 def test_measure_lidar_other_offset_is_refused(tmp_path):
     rig = lce.load_rig("rlfs")
-    lidar = rig.lidars["lidar"].model_copy(update={"range_offset_m": 0.06})
-    other = rig.model_copy(update={"lidars": {"lidar": lidar}})
+    other = changed(rig, lidars__lidar__range_offset_m=0.06)
     sessions = [lce.Session.create(tmp_path / f"{k}", each) for k, each in enumerate((rig, other))]
     with pytest.raises(UsageError):
         measure_lidar(sessions, found=[seen(0.0)] * 2)
