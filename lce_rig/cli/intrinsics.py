@@ -151,9 +151,10 @@ def lidar_intrinsics(
 ) -> None:
     """Estimate the constant errors of a LiDAR from the boards of one or several SESSIONs.
 
-    These are range, azimuth and elevation of each laser and the displacement of the beams' origin. Boards
-    must have stood still. `calibrate` starts from the errors in the profile that --save-profile writes.
-    Exits with 6 for too few captures, with 7 if boards moved or captures do not determine the lasers' ranges.
+    These are range, azimuth and elevation of each laser, the displacement of the beams' origin, and an
+    offset of all ranges where it is significant (range_offset_m). Boards must have stood still. `calibrate`
+    starts from the errors in the profile that --save-profile writes. Exits with 6 for too few captures, with
+    7 if boards moved or captures do not determine the lasers' ranges.
     """
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
@@ -182,9 +183,15 @@ _ERRORS = (
 
 def _errors(document: dict[str, Any]) -> Iterator[str]:
     """State the spread of each kind of error over the lasers, and the lens."""
-    lasers, n_captures = document["lasers"], document["n_captures"]
+    lasers, n_captures = document.get("lasers", ()), document["n_captures"]
     sessions = show.counted(len(n_captures), "session")
-    yield f"{show.counted(sum(n_captures), 'capture')} of {sessions}, {len(lasers)} lasers"
+    of_lasers = f"{len(lasers)} lasers" if lasers else "too few for single lasers"
+    yield f"{show.counted(sum(n_captures), 'capture')} of {sessions}, {of_lasers}"
+    if document["range_offset_m"] is not None:
+        offset, sigma = (1000 * document[f"range_offset{part}_m"] for part in ("", "_sigma"))
+        yield f"  {'range offset':<13}{offset:+.1f} +- {sigma:.1f} mm, of all lasers"
+    if not lasers:
+        return
     for name, key, sigma_key, scale, digits, unit in _ERRORS:
         errors = [scale * row[key] for row in lasers]
         sigma = float(np.median([scale * row[sigma_key] for row in lasers]))

@@ -362,7 +362,8 @@ class Calibration:
         channel_results: time offset and noise of each of these.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
-            with `intrinsics`, and with point clouds as the LiDAR's driver delivers them.
+            with `intrinsics`, and with point clouds as the LiDAR's driver delivers them, less the profile's
+            range offset.
         cov_shared: (6, 6) the part of it that all sessions of one board have in common, as the profile states
             this; zero if unknown.
         contributions: the causes of `cov`, the largest first.

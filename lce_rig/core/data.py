@@ -7,6 +7,8 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.geometry import shortened
+
 MAX_TIME_NS = 1 << 62
 """No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
 NO_RING = -1
@@ -55,6 +57,7 @@ class Scan:
         ring: (N,) int16, 0 = lowest elevation; `NO_RING` throughout without rings.
         offset_ns: (N,) int64 firing time after stamp_ns; None if the recording carries none.
         host_ns: arrival at the host; None if unknown.
+        range_offset_m: already subtracted from the ranges; 0 for a scan as recorded.
     """
 
     sensor: str
@@ -64,6 +67,25 @@ class Scan:
     ring: NDArray[np.int16]
     offset_ns: NDArray[np.int64] | None = None
     host_ns: int | None = None
+    range_offset_m: float = 0.0
+
+    def corrected(self, range_offset_m: float) -> "Scan":
+        """Subtract a constant from all ranges of a scan as recorded, along each ray from the origin.
+
+        A scan corrected by the same offset is returned unchanged, so that nothing is subtracted twice.
+        Returns not beyond the offset are dropped.
+
+        Args:
+            range_offset_m: positive where the driver's ranges are too long.
+        """
+        excess_m = range_offset_m - self.range_offset_m
+        if excess_m == 0:
+            return self
+        points = shortened(self.points, excess_m).astype(np.float32)
+        moved = replace(self, points=points, range_offset_m=range_offset_m)
+        # False for NaN.
+        is_behind = np.linalg.norm(self.points.astype(np.float64), axis=1) <= max(excess_m, 0.0)
+        return moved.select(~is_behind) if is_behind.any() else moved
 
     def select(self, keep: NDArray[Any]) -> "Scan":
         """Keep the points of a mask or index (N,) or (M,)."""

@@ -229,6 +229,13 @@ class PoseDifference:
         return {"rotation_deg": rotation_deg, "translation_m": translation_m}
 
 
+def shortened(points: NDArray[Any], by_m: float) -> Array:
+    """Move points (N, 3) towards the origin along their rays; one at the origin becomes NaN."""
+    points = np.asarray(points, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(points * (1 - by_m / np.linalg.norm(points, axis=1))[:, None])
+
+
 def fit_plane(points: NDArray[Any]) -> tuple[Array, float]:
     """Fit n.p + d = 0 by least squares, n towards the origin of the points' frame (d >= 0).
 

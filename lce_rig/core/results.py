@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import NO_RING
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, fit_plane, shortened
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,19 @@ class LidarBoard:
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
     edge_beam_m: Array | None = None
+
+    def corrected(self, range_offset_m: float) -> "LidarBoard":
+        """Subtract a constant from all ranges of the board, as `Scan.corrected` does before it is detected.
+
+        Args:
+            range_offset_m: positive where ranges are too long.
+        """
+        T = self.T_lidar_board.copy()
+        T[:3, 3] = shortened(T[None, :3, 3], range_offset_m)[0]
+        points = shortened(self.points, range_offset_m)
+        ends = shortened(self.edge_points, range_offset_m)
+        plane, sigma_m = fit_plane(points)
+        return replace(self, points=points, edge_points=ends, plane=plane, sigma_m=sigma_m, T_lidar_board=T)
 
     @property
     def has_rings(self) -> bool:

@@ -1,6 +1,7 @@
 """Detection of a profile's board in images and scans, with the profile's limits.
 
-All parts of the program detect boards here, live and offline, so that they agree.
+All parts of the program detect boards here, live and offline, so that they agree. The profile's range offset
+is subtracted from scans first.
 """
 
 from collections.abc import Sequence
@@ -127,6 +128,7 @@ class BoardFinder:
 
     def search_scan(self, scan: Scan) -> Search[list[LidarBoard]]:
         """Find the surfaces of the board's size in a whole scan."""
+        scan = self.rig.corrected(scan)
         find = find_lidar_boards if self.rig.lidars[scan.sensor].has_rings else find_unstructured_boards
         return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
 
@@ -137,6 +139,7 @@ class BoardFinder:
             scan: of a LiDAR of the rig.
             poses: at least one; those about which nothing is found are omitted.
         """
+        scan = self.rig.corrected(scan)
         look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
         looked = [look(scan, self.board, pose, self._limits(scan.sensor)) for pose in poses]
         boards = [result for result in looked if isinstance(result, LidarBoard)]

@@ -78,7 +78,12 @@ IMAGE_CUT_OFF = Kind(
     "board cut off by the {side} border: not all of the " + _CORNERS + " detected",
     "move the board away from the {side} border",
 )
-IMAGE_PART = Kind("image.part", _other_grid, _UNCOVER)
+IMAGE_PART = Kind(
+    "image.part",
+    _other_grid,
+    _UNCOVER,
+    actions={"events": "move the whole pattern sideways in view, or correct board.inner_corners"},
+)
 IMAGE_OTHER_BOARD = Kind(
     "image.other_board",
     _other_grid,

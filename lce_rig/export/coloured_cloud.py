@@ -41,7 +41,8 @@ def export_ply(job: ExportJob) -> list[Path]:
             channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]
             channels.sort(key=calibration.channels.__contains__, reverse=True)
             if channels and calibration.lidar in capture.lidars:
-                image, scan = capture.image(calibration.camera, channels[0]), capture.scan(calibration.lidar)
+                image = capture.image(calibration.camera, channels[0])
+                scan = job.rig.corrected(capture.scan(calibration.lidar))
                 clouds[capture.name] = coloured(image, scan, calibration, job, int(capture.name))
         if not clouds:
             job.findings.append(NO_IMAGES(calibration.camera, format="ply"))

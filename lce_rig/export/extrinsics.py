@@ -46,9 +46,15 @@ def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
         forward = f"takes points from {in_lidar} to {in_camera}: p_cam = R p_lidar + t"
         backward = f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t"
         backward += "; the camera's pose on the LiDAR"
+    # Points are used less this much of their range.
+    offsets_m = {"lidar": rig.lidars[c.lidar].range_offset_m}
+    if c.is_of_lidars:
+        offsets_m = {"lidar": rig.lidars[c.camera].range_offset_m, "other_lidar": offsets_m["lidar"]}
+    subtracted = {f"{name}_range_offset_m": value for name, value in offsets_m.items() if value}
     proven = "start_is_globally_optimal" if c.is_start_certified else "is_globally_optimal"
     return {
         **names,
+        **subtracted,
         "verdict": c.verdict,
         "reasons": [finding.sentence for finding in c.findings],
         poses[0]: _pose_block(forward, c.T_cam_lidar) | points[0],

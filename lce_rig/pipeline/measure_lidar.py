@@ -1,6 +1,7 @@
 """A LiDAR's constant errors from the boards of one or several sessions, and a profile that states them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,14 @@ from lce_rig.calibrate import (
     EstimateSettings,
     estimate_extrinsics,
 )
+from lce_rig.calibrate.algorithm_1.algorithm import solve
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.together import LidarErrors, estimate_lidar
+from lce_rig.core.board import Board
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.progress import Progress, silent
+from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
@@ -27,6 +32,7 @@ from lce_rig.session import Session
 # A laser's range must be known so much better than before for a profile to state it.
 _LEAST_GAIN = 2.0
 _FEWEST_CAPTURES = 8
+_STILL = "Give sessions whose board stood still, on a stand. Leave this one out."
 
 
 def measure_lidar(
@@ -47,7 +53,8 @@ def measure_lidar(
     Raises:
         UsageError: sessions of different boards or LiDARs, or a LiDAR without rings.
         NotEnoughDataError: too few captures that agree.
-        ResultRefusedError: a session's boards moved; the captures do not determine the lasers' ranges.
+        ResultRefusedError: a session's boards moved; the captures determine neither the lasers' ranges nor an
+            offset of them all.
     """
     rig = sessions[0].rig
     name = lidar or next(iter(rig.lidars))
@@ -60,11 +67,16 @@ def measure_lidar(
             raise UsageError(
                 f"{session.path} has another board than {sessions[0].path}", "Give sessions of one board."
             )
+        if session.rig.lidars[name].range_offset_m != rig.lidars[name].range_offset_m:
+            raise UsageError(
+                f"{session.path} has another range_offset_m of {name} than {sessions[0].path}",
+                "Calibrate all sessions with one profile first: `lce-rig calibrate SESSION --rig FILE`.",
+            )
     board, settings = rig.board.to_board(), rig.lidars[name]
     if not settings.has_rings:
         raise UsageError(f"{name} ({settings.model}) has no lasers of its own", "Calibrate it as it is.")
     options = EstimateSettings.of(CalibrateOptions("paper"), settings)
-    used, starts = [], []
+    used, starts, of_session, scale_sigma = [], [], [], 0.0
     for k, session in enumerate(sessions):
         detections = detect(session, progress=progress) if found is None else found[k]
         for pair in detections.pairs:
@@ -73,8 +85,15 @@ def measure_lidar(
                 continue
             candidates, _ = candidates_of(detections, pair)
             clocks = Clocks.of(session.rig, pair.camera, pair.lidar)
-            estimate = estimate_extrinsics({pair.channel: candidates}, board, options, clocks)
+            tolerances = Tolerances.of(session.rig.cameras[pair.camera], rig.board)
+            # An error of the lens would move the boards as errors of the ranges do.
+            with_lens = replace(options, tolerances=tolerances)
+            estimate = estimate_extrinsics({pair.channel: candidates}, board, with_lens, clocks)
             _require_still(session, estimate)
+            scale_sigma = max(
+                scale_sigma, float(np.hypot(tolerances.lens.focal_length, tolerances.square_size))
+            )
+            of_session.append(session)
             used.append([estimate.observations[capture] for capture in estimate.used])
             starts.append(estimate.T_cam_lidar)
     n_captures = sum(map(len, used))
@@ -83,8 +102,13 @@ def measure_lidar(
             f"{n_captures} captures of {name} agree with a frame camera ({_FEWEST_CAPTURES} needed)",
             "Collect more captures of a still board, or give more sessions of this LiDAR.",
         )
-    errors = estimate_lidar(used, board, starts, options)
+    errors = estimate_lidar(used, board, starts, options, scale_sigma or None, settings.range_offset_m)
+    excess_m = 0.0 if errors.offset_m is None else errors.offset_m - settings.range_offset_m
+    for session, observations in zip(of_session, used, strict=True):
+        _require_planes_meet(session, observations, board, excess_m)
     if errors.gain[0] < _LEAST_GAIN:
+        if errors.offset_m is not None:
+            return replace(errors, has_lasers=False)
         after_mm, before_mm = 1e3 * np.median(errors.found.lasers_sigma[0]), 1e3 * errors.prior_sigma[0]
         raise ResultRefusedError(
             f"{n_captures} captures do not determine the lasers' ranges: standard deviation {after_mm:.1f}, "
@@ -95,18 +119,20 @@ def measure_lidar(
 
 
 def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
-    """Refuse boards that moved between image and scan: the lens and the lasers would absorb the motion."""
+    """Refuse boards that moved while they were captured: the lens and the lasers would absorb the motion."""
     if any(channel.time_offset_s is not None for channel in estimate.channels):
-        what = f"{session.path}: the board moved while it was captured"
-    else:
-        rms_m, limit_m = estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M
-        if rms_m <= limit_m:
-            return
-        what = (
-            f"{session.path}: camera and LiDAR board planes differ by {1e3 * rms_m:.0f} mm rms "
-            f"(still boards: under {1e3 * limit_m:.0f} mm)"
-        )
-    raise ResultRefusedError(what, "Give sessions whose board stood still, on a stand. Leave this one out.")
+        raise ResultRefusedError(f"{session.path}: the board moved while it was captured", _STILL)
+
+
+def _require_planes_meet(
+    session: Session, observations: Sequence[Observation], board: Board, excess_m: float
+) -> None:
+    """Refuse boards that moved between image and scan, by their planes after ranges lost their excess."""
+    nearer = [replace(o, lidar=o.lidar.corrected(excess_m)) if excess_m else o for o in observations]
+    rms_m, limit_m = solve(nearer, board).diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M
+    if rms_m > limit_m:
+        what = f"{session.path}: camera and LiDAR board planes differ by {1e3 * rms_m:.0f} mm rms"
+        raise ResultRefusedError(f"{what} (still boards: under {1e3 * limit_m:.0f} mm)", _STILL)
 
 
 # Of each laser: range, azimuth and elevation, and their standard deviations.
@@ -115,13 +141,18 @@ _SIGMAS = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
 
 
 def lidar_document(errors: LidarErrors) -> dict[str, Any]:
-    """List a LiDAR's errors by the keys that they have in a profile."""
+    """List a LiDAR's errors by the keys that they have in a profile, without lasers only their offset."""
     estimate = errors.found
     in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
     figures = np.hstack([estimate.lasers.T * in_degrees, estimate.lasers_sigma.T * in_degrees]).round(7)
+    offset = {"range_offset_m": errors.offset_m, "range_offset_sigma_m": errors.offset_sigma_m}
+    shown = {name: None if value is None else round(value, 5) for name, value in offset.items()}
+    if not errors.has_lasers:
+        return {"n_captures": list(errors.n_captures), **shown}
     lens, lens_sigma = estimate.lens.round(7).tolist(), estimate.lens_sigma.round(7).tolist()
     return {
         "n_captures": list(errors.n_captures),
+        **shown,
         "lens_lateral_m": lens[0],
         "lens_lateral_sigma_m": lens_sigma[0],
         "lens_vertical_m_per_rad": lens[1],
@@ -141,7 +172,11 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
     """
     name, block = lidar or next(iter(session.rig.lidars)), lidar_document(errors)
     n = sum(block.pop("n_captures"))
-    for row in block["lasers"]:
+    offset = {key: block.pop(key) for key in ("range_offset_m", "range_offset_sigma_m")}
+    for row in block.get("lasers", ()):
         del row["n_points"]
-    text = set_value(session.profile_text(), f"lidars.{name}.intrinsics", as_yaml(block))
+    stated = {key: value for key, value in offset.items() if value is not None}
+    text = session.profile_text()
+    for key, value in (stated | ({"intrinsics": block} if block else {})).items():
+        text = set_value(text, f"lidars.{name}.{key}", as_yaml(value))
     write_profile(f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text, path)

@@ -255,7 +255,7 @@ def write_debug_images(
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
         seen, scan, events = _image(session, pair.camera, pair.channel, capture), None, None
         with suppress(SessionError):  # The detection of a damaged one says so.
-            scan = capture.scan(pair.lidar)
+            scan = session.scan(capture, pair.lidar)
             if (pair.camera, pair.channel) in event_channels(session.rig, capture):
                 events = capture.events(pair.camera)
         candidates = lidar if isinstance(lidar, list) else []
@@ -284,7 +284,7 @@ def _image(
     """Return a camera's image, or a LiDAR's cloud as one; None if it is damaged or events gave none."""
     with suppress(SessionError):
         if T_view is not None:
-            return draw_cloud(capture.scan(camera), T_view)
+            return draw_cloud(session.scan(capture, camera), T_view)
         if (camera, channel) not in event_channels(session.rig, capture):
             return capture.image(camera, channel)
         picture = event_picture(session, capture, camera, channel)

@@ -192,7 +192,7 @@ class SceneCaptures:
     def take_frame(self, frame: Frame) -> None:
         """Take what the rig saw at one time of a continuous recording."""
         self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
-        self._last = {scan.sensor: scan for scan in frame.scans}
+        self._last = {scan.sensor: self._rig.corrected(scan) for scan in frame.scans}
 
     def _take(
         self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
@@ -205,6 +205,7 @@ class SceneCaptures:
             own = [image for image in own if image.channel == frames] or own
             if scan is None:
                 continue
+            scan = self._rig.corrected(scan)
             # Grey: colour is not used, and would hold three times the memory.
             image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
             if image is None:

@@ -40,7 +40,7 @@ def scene_views(session: Session, detections: Detections, c: Calibration) -> lis
     for name in evenly(names, _MOST_CAPTURES):
         with suppress(SessionError):
             capture = session.capture(name)
-            image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
+            image, scan = capture.image(c.camera, channel), session.scan(capture, c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, c))
     return views

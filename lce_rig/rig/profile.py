@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Scan
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.geometry import Array, pose, project_to_so3
@@ -264,6 +265,10 @@ class Rig(Settings):
     sync: SyncSettings | None = None
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
+
+    def corrected(self, scan: Scan) -> Scan:
+        """Subtract the LiDAR's constant range offset from a scan; a corrected one is returned unchanged."""
+        return scan.corrected(self.lidars[scan.sensor].range_offset_m)
 
     def lens_of(self, extrinsics: Calibration) -> Intrinsics:
         """Return the intrinsics that belong to extrinsics: their own, else the profile's."""

@@ -143,8 +143,10 @@ class LidarSettings(Settings):
         columns: firings of each ring per revolution, where they differ from the model's.
         beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
+        range_offset_m: by how much the driver's ranges are too long, all alike; subtracted first.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
-        range_offset_sigma_m: standard deviation of that mean, the range error common to all lasers.
+        range_offset_sigma_m: standard deviation of that mean, the error common to all ranges left after
+            `range_offset_m`.
         intrinsics: measured constant errors; None if there are none.
     """
 
@@ -161,6 +163,7 @@ class LidarSettings(Settings):
     max_range_m: Positive
     beam_aperture_m: NotNegative
     beam_divergence_rad: NotNegative
+    range_offset_m: Annotated[float, Field(ge=-1, le=1)] = 0.0
     laser_bias_sigma_m: RangeError
     range_offset_sigma_m: RangeError
     intrinsics: LidarIntrinsicsSettings | None = None

@@ -262,6 +262,14 @@ class Session:
             )
         raise SessionError(f"{self.path} has no capture {name!r}; it has {len(self.captures)}")
 
+    def scan(self, capture: Capture, lidar: str) -> Scan:
+        """Read a capture's scan less the profile's range offset; `Capture.scan` reads it as recorded.
+
+        Raises:
+            SessionError: there is none, or it is damaged.
+        """
+        return self.rig.corrected(capture.scan(lidar))
+
     def reject(self, name: str, reason: str = "") -> None:
         """Put a capture aside: it is used no more, and not collected again.
 

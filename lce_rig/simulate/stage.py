@@ -1,7 +1,7 @@
 """The constants of a simulated session: the room, the sensors' true poses and their own errors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any, Literal
 
@@ -76,11 +76,11 @@ class Stage:
 
     def measure(self, lidar: str, sweep: Sweep, rng: np.random.Generator, stamp_ns: int) -> Scan:
         """Measure what the beams of a LiDAR hit, with its own errors."""
-        settings = self.rig.lidars[lidar]
+        settings, noise = self.rig.lidars[lidar], self.noise[lidar]
         return measure_sweep(
             sweep,
             self.models[lidar],
-            self.noise[lidar],
+            replace(noise, range_offset_m=noise.range_offset_m + settings.range_offset_m),
             rng,
             laser_bias_m=self.laser_bias_m[lidar],
             sensor=lidar,

@@ -33,6 +33,18 @@ class Unusable(LiveSource):
         return SourceStatus(self.sensor)
 
 
+class TimedBoard(SyncBoard):
+    """A sync board that counts as open once its clock is known and each line has pulsed, on any host."""
+
+    def open(self):
+        super().open()
+        early = list(self._early)
+        while not (self.host_clock and {"cam", "pps"} <= {pulse.sensor for pulse in early}):
+            assert not self.is_stopping
+            early += self.read()
+        self._early = early
+
+
 ABSENT = Unusable("gone", SourceError("it is not there", "Plug it in."))
 
 
@@ -41,7 +53,7 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same():
         settings = SyncSettings.model_validate(
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
         )
-        seen = observe([ABSENT, Unusable("bad", ZeroDivisionError("a slip")), SyncBoard(settings)], 1.0)
+        seen = observe([ABSENT, Unusable("bad", ZeroDivisionError("a slip")), TimedBoard(settings)], 0.5)
     assert seen["gone"].failure is not None and seen["gone"].failure is ABSENT.error
     assert seen["bad"].failure is not None and "ZeroDivisionError" in seen["bad"].failure.what
     board = seen["sync"]

@@ -209,7 +209,7 @@ def draw_check(
     scans = []
     for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
         with suppress(SessionError):
-            scans.append(session.capture(name).scan(check.pair.lidar))
+            scans.append(session.scan(session.capture(name), check.pair.lidar))
     limits_m = range_limits(scans)
     shown = []
     for done, name in enumerate(names, start=1):
@@ -218,7 +218,7 @@ def draw_check(
         if image is not None:
             # A capture whose scan cannot be read is not drawn.
             with suppress(SessionError):
-                scan, board = capture.scan(check.pair.lidar), detections.of(check.pair, name)[0]
+                scan, board = session.scan(capture, check.pair.lidar), detections.of(check.pair, name)[0]
                 picture = _draw(name, image, scan, session, check, board, limits_m)
                 canvas.write_picture(folder / f"{name}.png", picture)
                 shown.append((name, "; ".join(_figures(name, check)), _cause(name, c)))

@@ -57,7 +57,7 @@ class CaptureIn3D:
         lidar = calibrations[0].lidar
         if lidar not in capture.lidars:
             raise SessionError(f"capture {capture.name} has no scan of {lidar}", "Choose another capture.")
-        scan = capture.scan(lidar)
+        scan = session.scan(capture, lidar)
         colours, is_seen = np.zeros((len(scan.points), 3), np.uint8), np.zeros(len(scan.points), bool)
         for c in calibrations:
             for channel in c.channels:
