@@ -21,6 +21,7 @@ from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection,
 from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
 from lce_rig.detect.events.search import find_event_board
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.findings import LIDAR_OTHER_ORIGIN
 from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
@@ -360,8 +361,9 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
         agreeing = {each.capture for each in consensus.observations}
         T_lidar_cam = invert(consensus.T_cam_lidar)
         for name in detections.captures(pair):
-            image, _ = detections.of(pair, name)
-            if name not in agreeing and not isinstance(image, Refusal):
+            image, scan = detections.of(pair, name)
+            is_moved = isinstance(scan, Refusal) and scan.code == LIDAR_OTHER_ORIGIN.code
+            if name not in agreeing and not isinstance(image, Refusal) and not is_moved:
                 poses = [T_lidar_cam @ T_cam_board for T_cam_board in camera_poses(image)]
                 expected.setdefault(pair.lidar, {}).setdefault(name, poses)
     return expected
