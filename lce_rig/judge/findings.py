@@ -20,7 +20,10 @@ _OF_POSES = _OF_DISTANCES + (
 # A chance at which sessions that agree are still said to differ more than predicted.
 _UNLIKELY = 0.05
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
+_OF_FEW = ["verdict.sensors_disagree", "verdict.few_used", "verdict.few_placements"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
+    "association.mirrored": _OF_FEW,
+    "association.exchanged_images": _OF_FEW,
     "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics verdict.laser_angles".split(),
     "verdict.moved": f"{_OF_POSES}verdict.laser_angles".split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),

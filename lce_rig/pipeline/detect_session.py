@@ -10,10 +10,11 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from lce_rig.calibrate.association import find_association_error
 from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, refusal_of
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import LidarBoard, Observation
@@ -336,6 +337,14 @@ def match_sensors(
     elif len(candidates) >= 3:
         refused |= {item.capture: NO_AGREEMENT.refusal(n_captures=len(candidates)) for item in candidates}
     return dict(sorted(refused.items())), chosen
+
+
+def association_errors(rig: Rig, detections: Detections, pair: Pair) -> list[Finding]:
+    """List the error, if any, by which images and scans of a pair do not belong together."""
+    candidates, _ = candidates_of(detections, pair)
+    consensus = _consensus(rig, candidates)
+    error = find_association_error(candidates, rig.board.to_board(), consensus)
+    return [] if error is None else [error]
 
 
 def _consensus(rig: Rig, candidates: Sequence[Observation]) -> Consensus | None:
