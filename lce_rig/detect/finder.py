@@ -181,7 +181,7 @@ def check_origin(scan: Scan) -> Refusal | None:
     apex = find_apex(scan.points, scan.ring)
     if apex is None or not apex.is_beyond(MAX_APEX_M):
         return None
-    x_m, y_m, z_m = (np.round(apex.position_m, 3) + 0.0).tolist()
+    x_m, y_m, z_m = (np.round(apex.position_m, 2) + 0.0).tolist()  # to 1 cm, so that scans agree
     return LIDAR_OTHER_ORIGIN.refusal(x_m=x_m, y_m=y_m, z_m=z_m, limit_m=MAX_APEX_M)
 
 
