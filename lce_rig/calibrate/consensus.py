@@ -118,6 +118,12 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
     return Consensus(pose(R_best, t_best), tuple(observations), refused)
 
 
+def agrees_with(item: Observation, T_cam_lidar: Array) -> bool:
+    """Check whether a camera pose and a candidate of one capture agree with extrinsics (4, 4)."""
+    _, r2 = _score(_list_pairs([item]), T_cam_lidar[None, :3, :3], T_cam_lidar[None, :3, 3])
+    return bool(r2.min() < 1)
+
+
 def camera_poses(image: ImageBoard) -> list[Array]:
     """List the poses (4, 4) of the board that an image leaves open."""
     if image.T_cam_board_alternative is None or image.chi2_gap > _MAX_CHI2_GAP:

@@ -19,7 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import solve
+from lce_rig.calibrate.association import find_association_error, is_of_all
 from lce_rig.calibrate.consensus import Consensus, find_consensus
+from lce_rig.calibrate.findings import FEW_AGREE, UNDETERMINED
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.motion.board_motion import sample_poses
@@ -32,6 +34,7 @@ from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import PoseDifference, difference
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
@@ -59,7 +62,24 @@ def estimate_extrinsics(
     """
     begin(progress, "intrinsics and board")
     candidates, settings = _with_session_lens(candidates, board, settings)
-    agreed, noise_px = _agree(candidates, board)
+    agreed, noise_px, errors = _agree(candidates, board)
+    try:
+        estimate = _estimate(candidates, agreed, noise_px, board, settings, clocks, progress)
+    except NotEnoughDataError as error:
+        raise _before_geometry(error, candidates, agreed) from error
+    return replace(estimate, association=errors)
+
+
+def _estimate(
+    candidates: Mapping[str, Sequence[Observation]],
+    agreed: Mapping[str, Consensus],
+    noise_px: Mapping[str, float],
+    board: Board,
+    settings: EstimateSettings,
+    clocks: Clocks,
+    progress: Progress,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from the captures that agree."""
     matched = {name: consensus.observations for name, consensus in agreed.items()}
     scans, conflicts = join_scans(matched, candidates)
     samples = sample_poses(scans, clocks, noise_px)
@@ -158,15 +178,29 @@ def _with_session_lens(
 
 def _agree(
     candidates: Mapping[str, Sequence[Observation]], board: Board
-) -> tuple[dict[str, Consensus], dict[str, float]]:
-    """Find each channel's consensus and corner noise, px; the channel with the steadiest corners first."""
+) -> tuple[dict[str, Consensus], dict[str, float], tuple[Finding, ...]]:
+    """Find each channel's consensus and corner noise, px; the channel with the steadiest corners first.
+
+    Channels in which an error of association explains most captures are skipped; those of others are listed.
+    """
     agreed: dict[str, Consensus] = {}
     troubles: list[NotEnoughDataError] = []
+    errors: list[Finding] = []
     for channel, items in candidates.items():
+        consensus, trouble = None, None
         try:
-            agreed[channel] = find_consensus(items, board)
+            consensus = find_consensus(items, board)
         except NotEnoughDataError as error:
-            troubles.append(error)
+            trouble = error
+        cause = find_association_error(items, board, consensus)
+        if cause is not None and is_of_all(cause):
+            trouble = NotEnoughDataError.of(cause)
+        elif cause is not None:
+            errors.append(cause)
+        if trouble is not None:
+            troubles.append(trouble)
+        elif consensus is not None:
+            agreed[channel] = consensus
     if not agreed:
         raise troubles[0]
     # Of each channel's corners per coordinate, from the residuals of all its boards.
@@ -174,7 +208,21 @@ def _agree(
         name: float(np.sqrt(np.mean([o.image.sigma_px**2 for o in consensus.observations])))
         for name, consensus in agreed.items()
     }
-    return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}, noise
+    return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}, noise, tuple(errors)
+
+
+def _before_geometry(
+    error: NotEnoughDataError,
+    candidates: Mapping[str, Sequence[Observation]],
+    agreed: Mapping[str, Consensus],
+) -> NotEnoughDataError:
+    """Name the disagreement of most captures instead of the few that agree and leave a direction open."""
+    n_agreeing = sum(len(consensus.observations) for consensus in agreed.values())
+    n_captures = sum(len(candidates[channel]) for channel in agreed)
+    if error.finding is None or error.finding.code != UNDETERMINED.code or 2 * n_agreeing >= n_captures:
+        return error
+    needed = n_captures // 2 + 1
+    return NotEnoughDataError.of(FEW_AGREE(n_agreeing=n_agreeing, n_captures=n_captures, n_needed=needed))
 
 
 def _with_consensus(estimate: CalibrationEstimate, agreed: Sequence[Consensus]) -> CalibrationEstimate:

@@ -1,7 +1,7 @@
 """Findings of the calibration: captures that disagree, and captures that are too few."""
 
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.phrasing import captures_to_add
+from lce_rig.core.phrasing import captures_to_add, fill
 
 
 def _tilt(finding: Finding) -> str:
@@ -23,6 +23,32 @@ def _elsewhere(finding: Finding) -> str:
     )
 
 
+_MATCH = "match images and scans by time or name, and collect into a new session"
+_ORDERS = {
+    "late": "one capture late: {n_explained} of {n_captures} fit the scan of the capture before",
+    "early": "one capture early: {n_explained} of {n_captures} fit the scan of the capture after",
+    "reversed": "in reversed order: {n_explained} of {n_captures} fit a scan from the other end",
+}
+
+
+def _mirrored(finding: Finding) -> str:
+    """Images or scans are mirrored: {n_explained} of {n_captures} ({captures}), {n_agreeing} as they are."""
+    some = bool(finding.figures["captures"])
+    what = "images of {captures:few} are" if some else "images or scans are"
+    return fill(
+        what
+        + " mirrored: {n_explained} of {n_captures} captures agree when mirrored, {n_agreeing} as they are",
+        finding.figures,
+    )
+
+
+def _other_order(finding: Finding) -> str:
+    """Images are late, early or reversed ({order}): {n_explained} of {n_captures}, {n_agreeing} their own."""
+    return fill(
+        f"images are {_ORDERS[str(finding.figures['order'])]}, {{n_agreeing}} their own", finding.figures
+    )
+
+
 FEW_CAPTURES = Kind(
     "shortage.few_captures",
     "{n_captures} captures show the board in both sensors (minimum {n_needed})",
@@ -34,6 +60,15 @@ FEW_AGREE = Kind(
     "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics",
     "check board size, intrinsics, and the pairing of images with scans",
     severity="warning",
+)
+MIRRORED = Kind(
+    "association.mirrored", _mirrored, "switch off mirroring in the camera; give points x forward, y left"
+)
+OTHER_ORDER = Kind("association.other_order", _other_order, _MATCH)
+EXCHANGED_IMAGES = Kind(
+    "association.exchanged_images",
+    "images are exchanged: {n_explained} of {n_captures} ({captures:few}) fit the scan of another capture",
+    _MATCH,
 )
 UNDETERMINED = Kind(
     "shortage.undetermined",

@@ -11,7 +11,7 @@ from lce_rig.calibrate.plane_and_ends import ends_on_board, extract_features, pl
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, PoseDifference, rotation_angle, sigma_sizes
 from lce_rig.core.results import Observation
 
@@ -88,6 +88,7 @@ class CalibrationEstimate:
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: of the camera, with the time offset of each; empty if they were not separated.
         channel_difference: of the extrinsics of two channels; None where they cannot be compared.
+        association: errors by which images and scans of some captures do not belong together.
     """
 
     T_cam_lidar: Array
@@ -109,6 +110,7 @@ class CalibrationEstimate:
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()
     channel_difference: PoseDifference | None = None
+    association: tuple[Finding, ...] = ()
 
     @property
     def used(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 import lce_rig as lce
+from lce_rig.calibrate.association import is_of_all
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.cli import show
 from lce_rig.cli.options import explain_option, json_option, session_argument
@@ -17,7 +18,7 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
-from lce_rig.pipeline.detect_session import candidates_of, match_sensors
+from lce_rig.pipeline.detect_session import association_errors, candidates_of, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
@@ -81,7 +82,10 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
 
 
 def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[Finding]:
-    """Compare the plate's size in all scans of a pair, and the boards' distances, with the profile."""
+    """Compare the plate's size in all scans of a pair, and the boards' distances, with the profile.
+
+    Images and scans that do not belong together are named before, and alone where they concern all captures.
+    """
     from lce_rig.judge.verdict import distance_findings, plate_findings
 
     scans: list[LidarBoard | Refusal] = []
@@ -91,6 +95,9 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
             scans.append(scan)
         elif name not in refused or refused[name].stage == "image":
             scans.append(scan[0])
+    association = association_errors(rig, detections, pair) if pair.channel else []
+    if any(is_of_all(each) for each in association):
+        return association
     both = candidates_of(detections, pair)[0]
     in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
     in_lidar = np.array([each.lidar.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
@@ -98,7 +105,7 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     if pair.channel:
         n_misfits = sum(refusal.code == IMAGE_MISFIT.code for refusal in refused.values())
         of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m, n_misfits=n_misfits)
-    return [*of_distances, *plate_findings(scans, rig.board.to_board())]
+    return [*association, *of_distances, *plate_findings(scans, rig.board.to_board())]
 
 
 def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:

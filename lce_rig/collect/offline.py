@@ -17,7 +17,9 @@ from lce_rig.collect.placement_dedupe import (
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Losses, Refusal
+from lce_rig.core.phrasing import as_line
 from lce_rig.core.progress import Progress, silent
+from lce_rig.detect.finder import check_origin
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import (
     ContinuousRecording,
@@ -139,6 +141,8 @@ class _Collector:
                     self.report.n_known += 1
                 else:
                     images, scans, notes = files.read()
+                    for scan in scans:
+                        _require_own_frame(scan, files.label)
                     self.report.note(notes)
                     self._store(key, files.label, images, scans, {})
             except SourceError as error:
@@ -288,10 +292,21 @@ class _Collector:
         """Yield samples up to a tear, whose error is kept: moments before it are still captured."""
         done, self._torn = 0, None
         try:
+            known = set[str]()
             for sample in check_overlap(recording.samples(), self._session.rig, recording.notes):
+                if isinstance(sample, Scan) and sample.sensor not in known:
+                    _require_own_frame(sample, str(recording.path))
+                    known.add(sample.sensor)
                 yield sample
                 if not isinstance(sample, Events):
                     done += 1
                     self._progress(done, recording.n_samples)
         except SourceError as error:
             self._torn = error
+
+
+def _require_own_frame(scan: Scan, where: str) -> None:
+    """Raise SourceError for a scan whose points are not in its LiDAR's own frame."""
+    moved = check_origin(scan)
+    if moved is not None:
+        raise SourceError(f"{where}: {scan.sensor}: {moved.text}", as_line(moved.advice))

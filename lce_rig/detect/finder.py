@@ -8,16 +8,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
+import numpy as np
+
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import NO_RING, Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.ring_apex import MAX_APEX_M, find_apex
 from lce_rig.detect.findings import (
     IMAGE_NEAR_BORDER,
     IMAGE_SMALL_SQUARES,
     IMAGE_TILTED,
+    LIDAR_OTHER_ORIGIN,
     LIDAR_OTHER_SIZE,
     LIDAR_RAGGED_EDGES,
     LIDAR_TOO_FEW_POINTS,
@@ -127,7 +131,10 @@ class BoardFinder:
         )
 
     def search_scan(self, scan: Scan) -> Search[list[LidarBoard]]:
-        """Find the surfaces of the board's size in a whole scan."""
+        """Find the surfaces of the board's size in a whole scan; refuse one in another frame."""
+        moved = check_origin(scan)
+        if moved is not None:
+            return Search(moved, moved)
         scan = self.rig.corrected(scan)
         find = find_lidar_boards if self.rig.lidars[scan.sensor].has_rings else find_unstructured_boards
         return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
@@ -165,6 +172,20 @@ class BoardFinder:
         problems = [_lidar_problem(board, self.board, self.rig.quality) for board in boards]
         kept = [board for board, problem in zip(boards, problems, strict=True) if problem is None]
         return Search(boards, kept or problems[0] or [])
+
+
+def check_origin(scan: Scan) -> Refusal | None:
+    """Refuse a scan whose rings meet far from the frame's origin, as one moved to the robot's frame.
+
+    Beams are taken to begin at the origin. From elsewhere, ring ends and ranges are wrong at every distance.
+    """
+    if not np.any(scan.ring != NO_RING):
+        return None
+    apex = find_apex(scan.points, scan.ring)
+    if apex is None or not apex.is_beyond(MAX_APEX_M):
+        return None
+    x_m, y_m, z_m = (np.round(apex.position_m, 2) + 0.0).tolist()  # to 1 cm, so that scans agree
+    return LIDAR_OTHER_ORIGIN.refusal(x_m=x_m, y_m=y_m, z_m=z_m, limit_m=MAX_APEX_M)
 
 
 def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:

@@ -175,6 +175,12 @@ LIDAR_NO_RETURNS = Kind(
     "{n_points} points, none of them finite and farther than {min_range_m:g} m",
     "check the LiDAR's cable, topic and driver settings",
 )
+LIDAR_OTHER_ORIGIN = Kind(
+    "lidar.other_origin",
+    "the rings meet at ({x_m:.2f}, {y_m:.2f}, {z_m:.2f}) m, not at the origin of the points' frame "
+    "(limit {limit_m:g} m)",
+    "record the points in the LiDAR's own frame, not in the robot's",
+)
 LIDAR_TOO_FEW_RINGS = Kind(
     "lidar.too_few_rings",
     "{n_rings} rings on the board at {distance_m:.1f} m (minimum {min_rings})",

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array
+from lce_rig.core.ring_apex import MAX_APEX_M, find_apex
 from lce_rig.rig import LidarSettings
 
 # Of rings that are inferred: bin of elevation, most of them, and how far a laser lies above the origin.
@@ -252,6 +253,7 @@ def _ring(
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0].astype(np.float64), points[:, 1]))
     thickness_deg = _ring_thickness_deg(ring_of_point, elevation, points)
     if thickness_deg > _MOST_THICKNESS_DEG:
+        _refuse_other_frame(points, ring_of_point.astype(np.int16), where)
         cause = f"field {name!r} numbers no rings: its points scatter by {thickness_deg:.1f} deg in elevation"
         return _inferred(points, where, cause, notes)
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
@@ -266,6 +268,18 @@ def _ring(
         return values.astype(np.int16)
     notes.add(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
     return rank[ring_of_point].astype(np.int16)
+
+
+def _refuse_other_frame(points: NDArray[np.float32], ring: NDArray[np.int16], where: str) -> None:
+    """Raise SourceError where rings scatter in elevation because they are seen from another frame."""
+    apex = find_apex(points, ring)
+    if apex is not None and apex.is_beyond(MAX_APEX_M) and apex.rms_rad < np.radians(_MOST_THICKNESS_DEG):
+        x, y, z = np.round(apex.position_m, 2) + 0.0  # no -0.00
+        meet = f"the rings meet at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        raise SourceError(
+            f"{where}: {meet}, not at the origin of the points' frame",
+            "Record the points in the LiDAR's own frame, not in the robot's.",
+        )
 
 
 def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[str]) -> NDArray[np.int16]:

@@ -185,11 +185,12 @@ class Table:
         layout = self.hypothesis.state.layout
         every = np.eye(layout.z.size)
         if cause == "range_offset":
-            return every[:, layout.lasers[0]].sum(axis=1, keepdims=True)
+            return np.asarray(every[:, layout.lasers[0]].sum(axis=1, keepdims=True))
         if cause in ("azimuths", "elevations"):
             # About their mean, which is part of the extrinsics.
-            at = layout.lasers[1 if cause == "azimuths" else 2]
-            return np.asarray(every[:, at] @ np.linalg.svd(np.eye(len(at)) - 1 / len(at))[0][:, :-1])
+            angles = layout.lasers[1 if cause == "azimuths" else 2]
+            L = len(angles)
+            return np.asarray(every[:, angles] @ np.linalg.svd(np.eye(L) - 1 / L)[0][:, :-1])
         at: Indices = {
             "squares": layout.z.of(["squares"]),
             "pattern": layout.z.of(["pattern"]),

@@ -20,7 +20,10 @@ _OF_POSES = _OF_DISTANCES + (
 # A chance at which sessions that agree are still said to differ more than predicted.
 _UNLIKELY = 0.05
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
+_OF_FEW = ["verdict.sensors_disagree", "verdict.few_used", "verdict.few_placements"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
+    "association.mirrored": _OF_FEW,
+    "association.exchanged_images": _OF_FEW,
     "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics verdict.laser_angles".split(),
     "verdict.moved": f"{_OF_POSES}verdict.laser_angles".split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
@@ -210,6 +213,21 @@ def _reach(finding: Finding) -> str:
     return f"the session covers {100 * finding.figure('covered'):.0f} % of the image and {known}"
 
 
+_NOMINAL_ERRORS = {
+    "inverted": "is inverted (p_cam = R p_lidar + t is meant)",
+    "reordered": "has its quaternion scalar last",
+    "reordered_inverted": "is inverted and has its quaternion scalar last",
+}
+
+
+def _corrected(finding: Finding) -> str:
+    """Enter {enter_quaternion_wxyz} and {enter_translation_m}."""
+    return f"nominal_extrinsics {_NOMINAL_ERRORS[finding.action]}: enter\n" + fill(
+        "quaternion_wxyz: [{enter_quaternion_wxyz:.4f}]\ntranslation_m: [{enter_translation_m:.4f}]",
+        finding.figures,
+    )
+
+
 def _scale(finding: Finding) -> str:
     """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
     scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
@@ -332,6 +350,7 @@ FAR_FROM_NOMINAL = Kind(
     "{rotation_deg:1deg}, {translation_m:mm} from the nominal extrinsics "
     "(tolerance {tolerance_deg:g} deg, {tolerance_m:mm})",
     "check nominal_extrinsics and frames in the profile, and the sensors used",
+    actions=dict.fromkeys(_NOMINAL_ERRORS, _corrected),
 )
 PLATE_SIZE = Kind(
     "verdict.plate_size", _plate, "measure the plate, then `lce-rig calibrate {session} --rig FILE`"

@@ -336,17 +336,31 @@ def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySet
 def _nominal(T: Array, nominal: NominalExtrinsic | None) -> list[Finding]:
     if nominal is None or nominal.source == "typical":
         return []
-    expected = nominal.to_matrix()
-    angle_deg = float(np.degrees(rotation_angle(T[:3, :3], expected[:3, :3])))
-    shift_m = float(np.linalg.norm(T[:3, 3] - expected[:3, 3]))
-    if angle_deg <= nominal.tolerance_deg and shift_m <= nominal.tolerance_m:
+
+    def apart(expected: Array) -> tuple[float, float]:
+        angle_deg = float(np.degrees(rotation_angle(T[:3, :3], expected[:3, :3])))
+        return angle_deg, float(np.linalg.norm(T[:3, 3] - expected[:3, 3]))
+
+    def fits(expected: Array) -> bool:
+        angle_deg, shift_m = apart(expected)
+        return angle_deg <= nominal.tolerance_deg and shift_m <= nominal.tolerance_m
+
+    if fits(nominal.to_matrix()):
         return []
+    angle_deg, shift_m = apart(nominal.to_matrix())
+    figures: dict[str, Any] = {}
+    meant = {error: entry for error, entry in nominal.corrections().items() if fits(entry.to_matrix())}
+    for entry in list(meant.values())[:1]:
+        figures["enter_quaternion_wxyz"] = entry.quaternion_wxyz
+        figures["enter_translation_m"] = entry.translation_m
     return [
         FAR_FROM_NOMINAL(
+            action=next(iter(meant), ""),
             rotation_deg=angle_deg,
             translation_m=shift_m,
             tolerance_deg=nominal.tolerance_deg,
             tolerance_m=nominal.tolerance_m,
+            **figures,
         )
     ]
 

@@ -361,7 +361,7 @@ def _judged(
     """Judge the extrinsics of index k and assemble their result."""
     own, estimate, validation = solved[k], solved[k].estimate, solved[k].validation
     mine = [link for link in links if k in link.members]
-    others = [finding for link in mine for finding in link.exchanged]
+    others = [*estimate.association, *(finding for link in mine for finding in link.exchanged)]
     others += [finding for link in mine for finding in link.contradictions]
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())

@@ -10,10 +10,11 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from lce_rig.calibrate.association import find_association_error
 from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, refusal_of
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import LidarBoard, Observation
@@ -21,6 +22,7 @@ from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection,
 from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
 from lce_rig.detect.events.search import find_event_board
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.findings import LIDAR_OTHER_ORIGIN
 from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
@@ -337,6 +339,14 @@ def match_sensors(
     return dict(sorted(refused.items())), chosen
 
 
+def association_errors(rig: Rig, detections: Detections, pair: Pair) -> list[Finding]:
+    """List the error, if any, by which images and scans of a pair do not belong together."""
+    candidates, _ = candidates_of(detections, pair)
+    consensus = _consensus(rig, candidates)
+    error = find_association_error(candidates, rig.board.to_board(), consensus)
+    return [] if error is None else [error]
+
+
 def _consensus(rig: Rig, candidates: Sequence[Observation]) -> Consensus | None:
     try:
         return find_consensus(candidates, rig.board.to_board())
@@ -360,8 +370,9 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
         agreeing = {each.capture for each in consensus.observations}
         T_lidar_cam = invert(consensus.T_cam_lidar)
         for name in detections.captures(pair):
-            image, _ = detections.of(pair, name)
-            if name not in agreeing and not isinstance(image, Refusal):
+            image, scan = detections.of(pair, name)
+            is_moved = isinstance(scan, Refusal) and scan.code == LIDAR_OTHER_ORIGIN.code
+            if name not in agreeing and not isinstance(image, Refusal) and not is_moved:
                 poses = [T_lidar_cam @ T_cam_board for T_cam_board in camera_poses(image)]
                 expected.setdefault(pair.lidar, {}).setdefault(name, poses)
     return expected

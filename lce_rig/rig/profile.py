@@ -11,7 +11,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.core.geometry import Array, invert, pose, project_to_so3
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
@@ -227,6 +227,25 @@ class NominalExtrinsic(Settings):
         else:
             R = project_to_so3(np.array(self.matrix))
         return pose(R, np.array(self.translation_m))
+
+    def corrections(self) -> dict[str, "NominalExtrinsic"]:
+        """Build the entry without each usual error, by the error's name.
+
+        "inverted": parent and child exchanged. "reordered": a quaternion given scalar last.
+        "reordered_inverted": both.
+        """
+        from scipy.spatial.transform import Rotation
+
+        entries = {}
+        if self.quaternion_wxyz is not None:
+            x, y, z, w = self.quaternion_wxyz
+            entries["reordered"] = self.model_copy(update={"quaternion_wxyz": (w, x, y, z)})
+        for error, entry in [("inverted", self), *((f"{name}_inverted", e) for name, e in entries.items())]:
+            T = invert(entry.to_matrix())
+            x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
+            update = {"quaternion_wxyz": (w, x, y, z), "translation_m": tuple(T[:3, 3].tolist())}
+            entries[error] = self.model_copy(update={"rpy_deg": None, "matrix": None, **update})
+        return entries
 
 
 class Rig(Settings):

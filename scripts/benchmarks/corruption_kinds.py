@@ -43,6 +43,7 @@ def corruptions() -> list[Corruption]:
 def _all() -> Iterator[Corruption]:
     yield from _swapped()
     yield from _mirrored()
+    yield from _frames()
     yield from _turned()
     yield from _scaled()
     yield from _elevations()
@@ -98,6 +99,7 @@ def _mirrored() -> Iterator[Corruption]:
         return pixels[:, ::-1]
 
     yield Corruption("images mirrored left to right", lambda s: _with_images(s, across))
+    yield Corruption("every other image mirrored left to right", lambda s: _every_other(s, across))
     yield Corruption("images mirrored top to bottom", lambda s: _with_images(s, lambda p: p[::-1]))
     yield Corruption("scans mirrored, y to -y", lambda s: _with_points(s, lambda p: p * [1, -1, 1]))
     yield Corruption("x and y of scans swapped", lambda s: _with_points(s, lambda p: p[:, [1, 0, 2]]))
@@ -106,6 +108,30 @@ def _mirrored() -> Iterator[Corruption]:
         lambda s: _with_points(_with_images(s, across), lambda p: p * [1, -1, 1]),
         "a mirrored world seen by mirrored sensors is as consistent as the true one",
     )
+
+
+def _every_other(samples: Samples, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Samples:
+    changed = _with_images(samples, change).images
+    return replace(
+        samples, images={**samples.images, **{name: changed[name] for name in samples.captures[1::2]}}
+    )
+
+
+def _frames() -> Iterator[Corruption]:
+    """Give points or the nominal pose in another frame than is meant."""
+    for up_m in (0.2, 0.7):
+        yield Corruption(
+            f"scans in a frame {up_m:g} m below the LiDAR",
+            lambda s, up_m=up_m: _with_points(s, lambda p: p + [0, 0, up_m]),  # type: ignore[misc]
+        )
+    yield Corruption("nominal pose inverted", _with_inverted_nominal)
+
+
+def _with_inverted_nominal(samples: Samples) -> Samples | None:
+    if not samples.rig.nominal_extrinsics:
+        return None
+    nominal = tuple(entry.corrections()["inverted"] for entry in samples.rig.nominal_extrinsics)
+    return _with_rig(samples, samples.rig.model_copy(update={"nominal_extrinsics": nominal}))
 
 
 def _turned() -> Iterator[Corruption]:

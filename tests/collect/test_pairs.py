@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from lce_rig.collect.offline import collect
 from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
+from lce_rig.detect.finder import BoardFinder, check_origin
 from lce_rig.io import open_recording
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
@@ -23,7 +25,11 @@ N_PAIRS = 5
 @pytest.fixture
 def folder(tmp_path):
     """Pictures and clouds of noise in rings."""
-    path = tmp_path / "recording"
+    return write_pairs(tmp_path / "recording")
+
+
+def write_pairs(path, height_m=0.0):
+    """Write pairs whose points lie in a frame below the LiDAR."""
     (path / "img").mkdir(parents=True)
     (path / "pcd").mkdir()
     rng = np.random.default_rng(0)
@@ -36,6 +42,7 @@ def folder(tmp_path):
         cloud["x"], cloud["y"] = rng.normal(4, 1, 4000), rng.normal(0, 1, 4000)
         cloud["ring"] = np.arange(4000) % 16
         cloud["z"] = np.hypot(cloud["x"], cloud["y"]) * np.tan(np.radians(cloud["ring"] * 2.0 - 15))
+        cloud["z"] += height_m
         (path / "pcd" / f"{k:05d}.pcd").write_bytes(encode_pcd(cloud))
     return path
 
@@ -147,3 +154,20 @@ def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
     assert len(report.captured) == 18 and not report.refused
     assert any("ring field" in note and "elevation" in note for note in report.notes)
     assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15
+
+
+@pytest.mark.parametrize("height_m", [0.2, 0.7])
+def test_pairs_in_the_robots_frame_are_refused(tmp_path, rig, height_m):
+    folder = write_pairs(tmp_path / "moved", height_m)
+    with Session.create(tmp_path / "s", rig) as session:
+        with pytest.raises(SourceError, match=rf"00000.*{height_m:.2f}\) m.*not at the origin") as caught:
+            run(session, folder, rig)
+        assert session.captures == []
+    assert "the LiDAR's own frame" in caught.value.hint
+
+
+def test_check_origin_refuses_the_robots_frame(tmp_path, rig):
+    folder = write_pairs(tmp_path / "moved", 0.2)
+    scan = open_recording(folder, rig).pairs[0].read()[1][0]
+    assert BoardFinder(rig).scan(scan).code == "lidar.other_origin"
+    assert check_origin(replace(scan, points=scan.points - np.float32([0, 0, 0.2]))) is None

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Certificate
 from lce_rig.core.findings import KINDS, Finding, Refusal
-from lce_rig.core.geometry import difference, perturb
+from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
     INTRINSICS,
@@ -29,7 +30,7 @@ from lce_rig.judge.split_consistency import Contrast
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import distance_findings, judge, plate_findings
 from lce_rig.lens.models import LensPrior
-from lce_rig.rig import load_rig
+from lce_rig.rig import NominalExtrinsic, load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, simulate
 from tests.calibrate.test_tolerances import KNOWN, REAL
 
@@ -135,6 +136,35 @@ def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimat
     assert verdict == "fail"
     assert reasons[0].code == "verdict.far_from_nominal"
     assert (reasons[0].figures["tolerance_deg"], reasons[0].figures["tolerance_m"]) == (5, 0.05)
+
+
+@pytest.mark.parametrize("error", ["inverted", "reordered", "reordered_inverted"])
+def test_nominal_with_a_usual_error_is_corrected(estimate, verdict_of, error):
+    T = estimate.T_cam_lidar if error == "reordered" else invert(estimate.T_cam_lidar)
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    entry = RIG.nominal("cam", "lidar").model_dump(exclude={"matrix", "rpy_deg"}) | {
+        "source": "cad",
+        "translation_m": tuple(T[:3, 3]),
+        "quaternion_wxyz": (w, x, y, z) if error == "inverted" else (x, y, z, w),
+    }
+    drawn = RIG.model_copy(update={"nominal_extrinsics": [NominalExtrinsic.model_validate(entry)]})
+    verdict, reasons = verdict_of(estimate, rig=drawn)
+    assert (verdict, reasons[0].code, reasons[0].action) == ("fail", "verdict.far_from_nominal", error)
+    figures = reasons[0].figures
+    printed = ", ".join(f"{value:.4f}" for value in figures["enter_translation_m"])
+    assert f"translation_m: [{printed}]" in reasons[0].advice
+    entry |= {key: figures[f"enter_{key}"] for key in ("quaternion_wxyz", "translation_m")}
+    corrected = NominalExtrinsic.model_validate(entry).to_matrix()
+    np.testing.assert_allclose(corrected, estimate.T_cam_lidar, atol=1e-9)
+
+
+def test_nominal_inverted_as_a_matrix_is_corrected(estimate, verdict_of):
+    T = invert(estimate.T_cam_lidar)
+    pose = {"translation_m": T[:3, 3].tolist(), "matrix": T[:3, :3].tolist()}
+    entry = NominalExtrinsic.model_validate({"camera": "cam", "lidar": "lidar", **pose})
+    reasons = verdict_of(estimate, rig=RIG.model_copy(update={"nominal_extrinsics": [entry]}))[1]
+    assert reasons[0].action == "inverted"
+    assert len(reasons[0].figures["enter_quaternion_wxyz"]) == 4
 
 
 def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of):
