@@ -190,7 +190,7 @@ def estimate_lidar(
     ]
     priors, usual = what_is_known(replace(options, known=None))
     # An offset beyond the profile's is tested with next to no prior of its own.
-    free = replace(priors, offset_m=_FREE_OFFSET_M, scale=scale_sigma or priors.scale)
+    free = replace(priors, offset_m=_FREE_OFFSET_M, squares=scale_sigma or priors.squares)
     joint = maximise_likelihood(apart, board, T_cam_lidar, free, usual)
     offset_m, offset_sigma_m = _common_offset(joint)
     is_significant = abs(offset_m) > _SIGNIFICANT * offset_sigma_m
