@@ -1,7 +1,15 @@
-"""What boards in view say about deployed extrinsics: `verify`'s residuals, axis by axis and all together.
+"""Compare deployed extrinsics with boards in view: all six axes together, and axis by axis.
 
-Pitch and height hide each other axis by axis: boards at one distance allow either. All six axes together have
-the change x with covariance C, of the boards and the deployed extrinsics, and x^T C^-1 x is chi-squared.
+The likelihood of `calibrate` estimates the extrinsics from these boards. They differ from the deployed ones
+by the tangent x, with covariance C if nothing moved, and x^T C^-1 x is chi-squared with six freedoms.
+This is the test of six unknowns that are freed of their prior, the deployed result. If one axis alone
+changed, it changed by
+
+    (C^-1 x)_a / (C^-1)_aa,    with variance 1 / (C^-1)_aa                                               (1)
+
+Boards and deployed result share the profile. Errors e of squares, pattern and plate move both, by M_b e and
+M_d e, and only the difference remains, zero for boards at the same places. As a rule it is not larger than
+either part, so C contains M_d M_d^T, as part of the deployed covariance, and not M_b M_b^T.
 """
 
 from dataclasses import dataclass
@@ -9,31 +17,32 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.likelihood.fit import JointEstimate, maximise_likelihood
+from lce_rig.calibrate.likelihood.levels import what_is_known
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, Tolerances
+from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
-from lce_rig.core.board import Board
+from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, PoseDifference, perturb, tangent_sizes
-from lce_rig.core.results import Observation
+from lce_rig.core.geometry import Array, PoseDifference, difference, tangent_sizes
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.judge.local_quadratic import OF_PROFILE, expand
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
-from lce_rig.rig import LidarSettings, Rig
+from lce_rig.rig import Rig
 from lce_rig.scene.alignment import IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS
 from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_HIDES, BOARD_UNSURE
 
-# What results of one rig differ by from session to session, m and rad, order of MOTIONS.
-_BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])
-# Without rings, outlines grow by the beam differently on each side, and squares whose ranges differ tilt
-# the plane: boards of a recorded Avia disagree with their own result by 25 mm and 0.7 deg.
-_BIAS_WITHOUT_RINGS = np.array([0.02, 0.02, 0.02, *np.radians([0.3, 0.3, 0.3])])
-_OUTLIER = 3.0  # times the median residual
-_MIN_PLACEMENTS = 3  # The scatter of fewer says little.
-# Six axes together changed beyond this, 99.9 % of the chi-squared distribution with six degrees of freedom.
+# Standard deviation of the difference between sessions of one rig beyond both covariances, m and rad: three
+# recorded sessions of one rig (rlfs01 to rlfs03) differ by up to 7 mm and 0.22 deg.
+_BIAS = np.repeat([0.005, np.radians(0.1)], 3)
+_MIN_PLACEMENTS = 3  # Fewer do not determine the scatter.
+# Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
 _CHANGED_CHI2 = 22.46
-# Axes of a joint change are those that moved by so many of their own standard deviations, or the farthest.
+# Smallest change along an eigen-direction that counts as a part of a joint change, standard deviations.
 _NAMED_SIGMAS = 2.0
 
 
@@ -54,30 +63,60 @@ class JointDrift(PoseDifference):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes that moved; none without a significant change."""
+        """Names of the axes with more than an even share of the significant part; empty if unchanged."""
         if not self.is_changed:
             return ()
-        sizes = np.abs(self.tangent) / np.sqrt(np.diag(self.cov))
-        return tuple(np.array(MOTIONS)[sizes >= min(_NAMED_SIGMAS, sizes.max())].tolist())
+        shares = (self._scale * self.significant) ** 2
+        return tuple(np.array(MOTIONS)[shares > shares.mean()].tolist())
+
+    @property
+    def significant(self) -> Array:
+        """The part (6,) of the change along eigen-directions of the covariance in which it is significant.
+
+        Boards at one distance do not separate pitch from height: a change of either appears along the
+        direction of both.
+        """
+        variances, directions = self._directions
+        along = (self._scale * self.tangent) @ directions
+        # At least the most significant one.
+        least = min(_NAMED_SIGMAS**2, float(np.max(along**2 / variances)))
+        return np.asarray(directions @ np.where(along**2 >= least * variances, along, 0.0) / self._scale)
 
     @property
     def finding(self) -> Finding:
-        """The change, as a finding."""
-        return BOARD_CHANGED_JOINTLY(axes=self.axes, sigmas=float(np.sqrt(self.chi2)), **self.sizes)
+        """The significant part of the change, as a finding."""
+        rotation_deg, translation_m = tangent_sizes(self.significant)
+        return BOARD_CHANGED_JOINTLY(
+            axes=self.axes,
+            sigmas=float(np.sqrt(self.chi2)),
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+        )
 
     @property
     def hidden(self) -> Finding:
-        """The largest change that the boards would not show, along the direction that they know least."""
-        scale = np.r_[np.ones(3), np.full(3, self.lever_m)]
-        values, vectors = np.linalg.eigh(self.cov * np.outer(scale, scale))
+        """The largest change that the boards would not show, along their least determined direction."""
+        variances, directions = self._directions
         # A shift of the mean by this much exceeds the threshold in about 95 % of trials.
         size = np.sqrt(_CHANGED_CHI2) + POWER_SIGMAS
-        rotation_deg, translation_m = tangent_sizes(size * np.sqrt(values[-1]) * vectors[:, -1] / scale)
-        weights = np.abs(vectors[:, -1])
+        least_known = directions[:, -1]
+        rotation_deg, translation_m = tangent_sizes(size * np.sqrt(variances[-1]) * least_known / self._scale)
+        weights = np.abs(least_known)
         turn, shift = MOTIONS[3 + int(np.argmax(weights[3:]))], MOTIONS[int(np.argmax(weights[:3]))]
         return BOARD_HIDES(
             rotation_deg=rotation_deg, translation_m=translation_m, rotation=turn, translation=shift
         )
+
+    @property
+    def _scale(self) -> Array:
+        """(6,) displacement of the boards, m, per unit of each axis."""
+        return np.asarray(np.r_[np.ones(3), np.full(3, self.lever_m)])
+
+    @property
+    def _directions(self) -> tuple[Array, Array]:
+        """Variances (6,) of the covariance, m^2, from the smallest; eigen-directions (6, 6) in columns."""
+        variances, directions = np.linalg.eigh(self.cov * np.outer(self._scale, self._scale))
+        return variances, directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +124,8 @@ class BoardDrift:
     """Deployed extrinsics compared with the boards of some captures.
 
     Attributes:
-        axes: one verdict each, order of MOTIONS, were it the only one that changed besides the one that
-            explains most.
-        metrics: residuals of the deployed extrinsics, as `verify` has them.
+        axes: verdict of each in the order of MOTIONS, as if no other changed but the one that explains most.
+        metrics: residuals of the deployed extrinsics, as in `verify`.
         n_boards: captures in which both sensors see the board.
         n_placements: places at which it was held.
         joint: the change of all axes together.
@@ -116,7 +154,7 @@ class BoardDrift:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """All axes together, axes that the boards find changed or cannot tell, and what they hide."""
+        """All axes together, axes that changed or are undetermined, and the largest hidden change."""
         joint = (self.joint.finding,) if self.joint.is_changed else ()
         axes = tuple(
             (BOARD_CHANGED if axis.state == "changed" else BOARD_UNSURE)(axis.axis, **axis.figures)
@@ -138,71 +176,62 @@ def watch_boards(
         detections: of the captures.
 
     Returns:
-        None where both sensors see the board at about the same place in fewer than three placements.
+        None if both sensors see the board at about the same place in fewer than three placements.
     """
     T_cam_lidar, pair = calibration.T_cam_lidar, Pair(calibration.camera, channel, calibration.lidar)
     board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
     meetings = find_meetings(rig, detections, pair, T_cam_lidar, calibration.channel_results)
-    met = [meeting.at_scan_time for meeting in meetings.values()]
-    if not met:
+    try:
+        agreed = find_consensus([meeting.at_scan_time for meeting in meetings.values()], board)
+    except NotEnoughDataError:
         return None
-    residuals = [capture_residual(calibration.T_cam_lidar, each, board) for each in met]
-    rms_m = np.array([np.hypot(each.plane_rms_m, each.edge_rms_m) for each in residuals])
-    # Another plate, or a board that moved between image and scan.
-    is_inlier = rms_m <= _OUTLIER * np.median(rms_m)
-    seen = [each for each, keep in zip(met, is_inlier, strict=True) if keep]
+    seen = agreed.observations
+    n_placements = int(group_placements(seen).max()) + 1
+    if n_placements < _MIN_PLACEMENTS:
+        return None
     lidar = rig.lidars[calibration.lidar]
-    cost = _expand(seen, board, calibration.T_cam_lidar, lidar)
-    if len(cost.groups) < _MIN_PLACEMENTS:
-        return None
-    cov_deployed = calibration.cov + np.diag((_BIAS if lidar.has_rings else _BIAS_WITHOUT_RINGS) ** 2)
-    sigmas = np.sqrt(np.diag(cov_deployed))
-    axes = [_judge(axis, cost, float(sigmas[axis])) for axis in range(6)]
+    tolerances = Tolerances.of(rig.cameras[calibration.camera], rig.board)
+    priors, usual = what_is_known(EstimateSettings.of(CalibrateOptions(), lidar, tolerances))
+    estimate = maximise_likelihood([seen], board, [agreed.T_cam_lidar], priors, usual)
+    cov_deployed = calibration.cov + np.diag(_BIAS**2)
+    cov = _own_covariance(estimate, n_placements) + cov_deployed
+    change = difference(estimate.T_cam_lidar[0], T_cam_lidar)
+    axes = [_judge(axis, change, cov) for axis in range(6)]
     if sum(axis.state == "changed" for axis in axes) > 1:
-        # One changed axis looks like several: that which explains most is changed, others are judged anew.
-        alone = [_alone(cost, axis) for axis in range(6)]
-        first = int(np.argmax([each.optimum()[0] ** 2 / each.covariance()[0, 0] for each in alone]))
-        moved = perturb(calibration.T_cam_lidar, alone[first].optimum()[0] * np.eye(6)[first])
-        rest = _expand(seen, board, moved, lidar)
-        axes = [axes[axis] if axis == first else _judge(axis, rest, float(sigmas[axis])) for axis in range(6)]
-    # The covariance of all axes by residuals, or by the jackknife if that is wider.
-    change, cov, without_each = cost.optimum()[:6], cost.covariance()[:6, :6], cost.without_each()[:, :6]
-    scatter = jackknife_scatter(without_each - without_each.mean(axis=0))
-    wider = max(float(np.trace(np.linalg.solve(cov, scatter))) / 6, 1.0)
-    joint = JointDrift(change, wider * cov + cov_deployed, lever_arm(seen))
-    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups), joint)
+        # One changed axis looks like several: the one that explains most is changed, the others are judged
+        # without its change.
+        alone = [_alone(axis, change, cov) for axis in range(6)]
+        first = int(np.argmax([size**2 / variance for size, variance in alone]))
+        rest = change - alone[first][0] * np.eye(6)[first]
+        axes = [axes[axis] if axis == first else _judge(axis, rest, cov) for axis in range(6)]
+    residuals = [capture_residual(T_cam_lidar, each, board) for each in seen]
+    joint = JointDrift(change, cov, lever_arm(seen))
+    return BoardDrift(tuple(axes), summarise(residuals), len(seen), n_placements, joint)
 
 
-def _alone(cost: Quadratics, axis: int) -> Quadratics:
-    """Keep one axis of the extrinsics and what all captures share."""
-    return cost.of(np.array([axis, *range(6, len(cost.prior))]))
+def _own_covariance(estimate: JointEstimate, n_placements: int) -> Array:
+    """Compute the covariance (6, 6) of the boards' extrinsics without errors of the profile."""
+    J = estimate.to_extrinsics[0]
+    cov = J @ np.asarray(sum(estimate.covariances)) @ J.T
+    return widen(cov, jackknife_scatter(estimate.cost.moves() @ J.T), n_placements)[0]
 
 
-def _expand(seen: list[Observation], board: Board, T_cam_lidar: Array, lidar: LidarSettings) -> Quadratics:
-    cost = expand(
-        seen,
-        board,
-        T_cam_lidar,
-        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
-        range_offset_sigma_m=lidar.range_offset_sigma_m,
-    )
-    return cost.hold(OF_PROFILE)
+def _alone(axis: int, change: Array, cov: Array) -> tuple[float, float]:
+    """Estimate the change of one axis, if no other changed, and its variance: equation (1)."""
+    information = np.linalg.inv(cov)
+    return float(information[axis] @ change / information[axis, axis]), float(1 / information[axis, axis])
 
 
-def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
-    """Estimate the change of one axis alone; the larger variance of residuals and jackknife counts."""
+def _judge(axis: int, change: Array, cov: Array) -> AxisDrift:
+    """Judge one axis of a change (6,) with covariance (6, 6), if no other changed."""
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
-    alone = _alone(cost, axis)
-    change = float(alone.optimum()[0])
-    variance = float(alone.covariance()[0, 0])
-    without_each = alone.without_each()[:, :1]
-    variance = max(variance, float(jackknife_scatter(without_each - without_each.mean())[0, 0]))
-    sigma = float(np.sqrt(variance + sigma_deployed**2))
+    size, variance = _alone(axis, change, cov)
+    sigma = float(np.sqrt(variance))
     smallest = (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma
     state: State = "unchanged"
-    if abs(change) > THRESHOLD_SIGMAS * sigma:
+    if abs(size) > THRESHOLD_SIGMAS * sigma:
         state = "changed"
     elif smallest > LARGEST[axis]:
         state = "unknown"
     reason = "" if state != "unknown" else "scene.board_unsure"
-    return AxisDrift(MOTIONS[axis], state, unit * change, unit * sigma, unit * smallest, reason)
+    return AxisDrift(MOTIONS[axis], state, unit * size, unit * sigma, unit * smallest, reason)

@@ -1,5 +1,7 @@
 """Boards in view judge deployed extrinsics in all six axes together, and beside the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,16 +23,15 @@ def deployed(change: Array) -> Calibration:
     return made_calibration(perturb(T_FORWARD, change), np.diag(SIGMAS**2))
 
 
-def watched(calibration: Calibration, seed: int) -> BoardDrift:
+def seen_by(calibration: Calibration, seed: int) -> Detections:
     boards = simulate(15, seed, Scenario(laser_bias_sigma_m=0.008, footprint_m=0.006))
     images = {board.capture: board.image for board in boards}
     scans = {board.capture: [board.lidar] for board in boards}
-    found = watch_boards(
-        RIG,
-        calibration,
-        "frames",
-        Detections({(calibration.camera, "frames"): images}, {calibration.lidar: scans}),
-    )
+    return Detections({(calibration.camera, "frames"): images}, {calibration.lidar: scans})
+
+
+def watched(calibration: Calibration, seed: int) -> BoardDrift:
+    found = watch_boards(RIG, calibration, "frames", seen_by(calibration, seed))
     assert found is not None
     return found
 
@@ -73,3 +74,38 @@ def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float,
     assert (pair.states["rotation_z"], pair.state) == (state, state)
     contradicts = [finding.subject for finding in pair.findings if finding.code == "scene.contradiction"]
     assert contradicts == (["rotation_z"] if state == "unknown" else [])
+
+
+def test_watch_boards_one_outlier_keeps_the_verdict() -> None:
+    calibration = deployed(np.zeros(6))
+    detections = seen_by(calibration, 1)
+    (key, images), (lidar, scans) = *detections.images.items(), *detections.lidars.items()
+    name = sorted(images)[0]
+    shifted = replace(images[name], T_cam_board=perturb(images[name].T_cam_board, 0.2 * np.eye(6)[0]))
+    board = watch_boards(
+        RIG, calibration, "frames", Detections({key: {**images, name: shifted}}, {lidar: scans})
+    )
+    assert board is not None
+    assert (board.n_boards, board.joint.is_changed) == (14, False)
+    assert {axis.state for axis in board.axes} == {"unchanged"}
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_watch_boards_moved_sensor_measures_the_change(axis: int) -> None:
+    change = np.where(axis == np.arange(6), np.repeat([0.08, np.radians(3.0)], 3), 0.0)
+    board = watched(deployed(-change), 2)
+    error = board.joint.tangent - change
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(board.joint.cov)))
+    assert board.axes[axis].state == "changed"
+    assert MOTIONS[axis] in board.joint.axes
+
+
+def test_joint_drift_names_pitch_with_height() -> None:
+    # Boards at one distance of 2.5 m see the sum of a height and 2.5 m times a pitch.
+    inverse = np.diag(np.r_[np.full(3, 0.01), np.radians([0.1, 0.1, 0.1])] ** -2)
+    seen = np.array([0.0, 1.0, 0.0, 2.5, 0.0, 0.0])
+    pair = np.ix_([1, 3], [1, 3])
+    inverse[pair] = np.outer(seen, seen)[pair] / 0.002**2 + np.diag([0.5**-2, 0.2**-2])
+    joint = JointDrift(np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0]), np.linalg.inv(inverse), 2.5)
+    assert joint.axes == ("translation_y", "rotation_x")
+    assert joint.finding.figures["translation_m"] == pytest.approx(0.03, abs=0.001)

@@ -1,22 +1,14 @@
 """The next placement, which shrinks the predicted covariance most, and those that a session lacks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT, CALIBRATE_LITTLE_GAIN, GUIDE_ADD
-from lce_rig.collect.guidance.evidence import (
-    Evidence,
-    Precision,
-    combine,
-    few_captures_factor,
-    shortfall,
-    sigmas,
-    weigh_placements,
-)
+from lce_rig.collect.guidance.evidence import Predictor, few_captures_factor, shortfall, sigmas
 from lce_rig.collect.guidance.instructions import describe_pose, instruct, is_there, say
 from lce_rig.collect.guidance.sensor_model import DIAMOND_DEG, SensorModel, SensorPlace, spread_candidates
 from lce_rig.collect.placement_dedupe import MIN_MOVE_M, MIN_TURN_DEG, find_alike
@@ -102,6 +94,8 @@ AVOIDED_M = 0.4
 _EFFORT = 0.01
 # Upper bound of the "captures left" shown to the user.
 _MOST_MORE = 60
+# Number of captures of each reachable placement in the limit of many.
+_MANY = 1e4
 
 
 class Guidance(NamedTuple):
@@ -109,11 +103,12 @@ class Guidance(NamedTuple):
 
     Attributes:
         n_captures: placements held.
-        sigma_rotation_deg, sigma_translation_m: predicted error now.
+        sigma_rotation_deg, sigma_translation_m: standard deviations that the calibration is predicted to
+            state now.
+        bound_rotation_deg, bound_translation_m: the same with a margin for few captures, which cannot show
+            how noisy they are; they have to be at most `ENOUGH_SHARE` of the target.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
         n_least: captures that it takes at least.
-        stated_rotation_deg, stated_translation_m: predicted standard deviations that the calibration will
-            state, which makes up for few captures; they have to be at most `ENOUGH_SHARE` of the target.
         n_more: about how many more captures it takes; 0 where there are enough, None where not known.
         T_cam_board: (4, 4) wanted; None where no reachable placement is new.
     """
@@ -123,8 +118,8 @@ class Guidance(NamedTuple):
     sigma_translation_m: float
     is_enough: bool
     n_least: int
-    stated_rotation_deg: float
-    stated_translation_m: float
+    bound_rotation_deg: float
+    bound_translation_m: float
     n_more: int | None
     T_cam_board: Array | None
 
@@ -148,12 +143,16 @@ class Planner:
         self.view = view
         self._min_move_m, self._min_turn_rad = min_move_m, np.radians(min_turn_deg)
         poses = spread_candidates(view, n_places)
-        evidence = weigh_placements(view.model, poses, view.T_cam_lidar)
+        self._predictor = Predictor(view.model, view.T_cam_lidar)
+        evidence = self._predictor.weigh(poses)
         # One ring more than needed, as people do not hold the board to the centimetre.
         is_seen = (evidence.n_rings > view.model.limits.min_rings) & (
             evidence.n_points >= view.model.limits.min_points
         )
         self.candidates, self._evidence = poses[is_seen], evidence.of(is_seen)
+        # Covariance that no placements can shrink; unknown without placements.
+        limit = self._predictor.combine(self._evidence, weight=_MANY).without_pattern
+        self._limit = limit if len(self.candidates) else np.zeros_like(limit)
 
     def guide(self, held: Array, present: Array | None = None, avoid: Array | None = None) -> Guidance:
         """Say how well the extrinsic is known, and where the board should go.
@@ -165,10 +164,10 @@ class Planner:
                 something is in the way, so that others near them are not asked for either.
         """
         model = self.view.model
-        evidence = self._weigh(held)
-        now = combine(evidence, model.errors)
-        after = combine(evidence, model.errors, self._evidence)
-        cost = shortfall(model, after.improvable)
+        evidence = self._predictor.weigh(held)
+        now = self._predictor.combine(evidence)
+        after = self._predictor.combine(evidence, self._evidence).without_pattern - self._limit
+        cost = shortfall(model, after)
         if present is not None:
             # Add the way in m and the turn in rad.
             way_m = np.linalg.norm(self.candidates[:, :3, 3] - present[:3, 3], axis=1)
@@ -180,19 +179,24 @@ class Planner:
         best = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
-        stated_rotation, stated_translation = sigmas(now.claimed(len(held)))
         n_least = model.limits.min_captures
-        worse = max(stated_rotation / model.target_sigma_rad, stated_translation / model.target_sigma_m)
+        improvable = now.without_pattern - self._limit
+        bound = sigmas(now.cov + (few_captures_factor(len(held)) - 1) * improvable)
+        worse = max(bound[0] / model.target_sigma_rad, bound[1] / model.target_sigma_m)
         return Guidance(
             n_captures=len(held),
             sigma_rotation_deg=float(np.degrees(rotation)),
             sigma_translation_m=float(translation),
             is_enough=bool(len(held) >= n_least and worse <= ENOUGH_SHARE),
             n_least=n_least,
-            stated_rotation_deg=float(np.degrees(stated_rotation)),
-            stated_translation_m=float(stated_translation),
+            bound_rotation_deg=float(np.degrees(bound[0])),
+            bound_translation_m=float(bound[1]),
             n_more=self._count_more(
-                now, now.scatter if best is None else after.scatter[best], len(held), n_least
+                now.cov,
+                improvable,
+                None if best is None else after[best],
+                len(held),
+                n_least,
             ),
             T_cam_board=wanted,
         )
@@ -233,35 +237,40 @@ class Planner:
             return None
         # Compute by which share the present and the wanted placement shrink the improvable covariance.
         placements = np.stack([present, wanted])
-        model, evidence = self.view.model, self._weigh(held)
-        now = shortfall(model, combine(evidence, model.errors).improvable)
-        after = combine(evidence, model.errors, self._weigh(placements))
-        gain, best = np.asarray(1 - shortfall(model, after.improvable) / now)
+        model, evidence = self.view.model, self._predictor.weigh(held)
+        now = self._predictor.combine(evidence).without_pattern
+        after = self._predictor.combine(evidence, self._predictor.weigh(placements)).without_pattern
+        gain, best = np.asarray(
+            1 - shortfall(model, after - self._limit) / shortfall(model, now - self._limit)
+        )
         if best < LEAST_GAIN or gain >= LEAST_SHARE * best:
             return None
         gains = {"gain": max(float(gain), 0.0), "best_gain": float(best)}
         return CALIBRATE_LITTLE_GAIN.refusal(instruction=instruction, **gains)
 
-    def _weigh(self, poses: Array) -> Evidence:
-        return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
-
-    def _count_more(self, now: Precision, scatter_then: Array, n_captures: int, n_least: int) -> int | None:
+    def _count_more(
+        self, cov: Array, improvable: Array, then: Array | None, n_captures: int, n_least: int
+    ) -> int | None:
         """Estimate how many more captures it takes, if each brings as much information as the next one.
 
         Args:
-            now: of the captures.
-            scatter_then: (6, 6) `Precision.scatter` after the next capture.
+            cov: (6, 6) predicted now.
+            improvable: (6, 6) the part of it that captures can shrink.
+            then: (6, 6) that part after the next capture; None where no placement is new.
             n_captures: so far.
             n_least: captures needed at least.
         """
         model = self.view.model
         targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))
         # More captures change nothing of what all share.
-        constant = np.square(sigmas(now.lasers + now.offset))
-        before, after = (1 / np.maximum(np.square(sigmas(s)), 1e-18) for s in (now.scatter, scatter_then))
+        constant = np.square(sigmas(cov - improvable))
+        before, after = (
+            1 / np.maximum(np.square(sigmas(s)), 1e-18)
+            for s in (improvable, improvable if then is None else then)
+        )
         for n_more in range(max(n_least - n_captures, 0), _MOST_MORE):
-            scatter = 1 / (before + n_more * np.maximum(after - before, 0.0))
-            if np.all(few_captures_factor(n_captures + n_more) * scatter + constant <= targets):
+            remaining = 1 / (before + n_more * np.maximum(after - before, 0.0))
+            if np.all(few_captures_factor(n_captures + n_more) * remaining + constant <= targets):
                 return n_more
         return None
 
@@ -314,10 +323,7 @@ def plan_captures(
     nominal = rig.nominal(camera, lidar)
     T_cam_lidar = _SAME_WAY if nominal is None else nominal.to_matrix()
     if calibration is not None:
-        T_cam_lidar, figures = calibration.T_cam_lidar, calibration.diagnostics
-        rms_m = figures.fit_plane_rms_m, figures.fit_edge_rms_m
-        if np.isfinite(rms_m).all():
-            model = replace(model, errors=model.errors.learned(*rms_m, len(held)))
+        T_cam_lidar = calibration.T_cam_lidar
     planner, wanted, needed = Planner(SensorPlace(model, T_cam_lidar)), held, rig.calibration
     guidance = planner.guide(held)
     # What the calibration states over what the model predicts.

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors, what_is_known
+from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, KnownLidar, Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import DATA_SHEETS
@@ -12,73 +14,6 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
 from lce_rig.rig import QualitySettings, Rig
-
-#: How many captures' residuals the assumed errors are worth.
-PRIOR_CAPTURES = 5
-#: Rms distance of a board's points from its middle line: what a tilt moves them by.
-BOARD_LEVER_M = 0.2
-# Without rings, returns all along the outline let the calibration estimate the ranges' offset: it states less
-# than a millimetre for it.
-_OUTLINED_OFFSET_M = 0.003
-
-
-@dataclass(frozen=True)
-class ErrorModel:
-    """Standard deviations of the measurements.
-
-    Errors of corners, ranges and ring ends average out over the many points of a capture. Errors common to
-    all its points do not: an imperfect lens model, a bowed board, an unsteady hand, an arm behind one edge.
-    Pose errors are stated as if they were the camera's.
-
-    Attributes:
-        corner_px: of a corner, per coordinate.
-        range_m: of a range, from shot to shot.
-        ring_end_m: of a ring's end across the board's edge, beyond the spacing of its points.
-        side_m: of all ring ends on one edge of the plate in one capture, drawn by things behind it.
-        tilt_rad: of the board's pose about its three axes, common to a capture.
-        depth_m: of the board's place along its normal, common to a capture.
-        laser_bias_m: of the lasers' constant range errors about their mean.
-        range_offset_m: of that mean.
-        plane_m, edge_m: typical residuals of a capture, by which the solver weighs planes against edges.
-        edge_shift_m: of the distance by which ring ends lie beyond the plate, a priori.
-    """
-
-    corner_px: float = 0.05
-    range_m: float = 0.010
-    ring_end_m: float = 0.004
-    side_m: float = 0.003
-    tilt_rad: float = 0.001
-    depth_m: float = 0.001
-    laser_bias_m: float = 0.008
-    range_offset_m: float = 0.005
-    plane_m: float = 0.0035
-    edge_m: float = 0.005
-    edge_shift_m: float = 0.015
-
-    def learned(self, plane_rms_m: float, edge_rms_m: float, n_captures: int) -> "ErrorModel":
-        """Adapt to the residuals that captures of this rig left.
-
-        Where planes fit worse than expected, the poses of boards err more; where ring ends do, all their
-        errors grow alike. What is assumed here counts like `PRIOR_CAPTURES`.
-
-        Args:
-            plane_rms_m, edge_rms_m: of the calibration so far ("fit_plane_rms_m", "fit_edge_rms_m").
-            n_captures: behind it.
-        """
-        share = n_captures / (n_captures + PRIOR_CAPTURES)
-        plane_m = float(np.sqrt((1 - share) * self.plane_m**2 + share * plane_rms_m**2))
-        edge_m = float(np.sqrt((1 - share) * self.edge_m**2 + share * edge_rms_m**2))
-        excess = max(plane_m**2 - self.plane_m**2, 0.0) / 2
-        growth = edge_m / self.edge_m
-        return replace(
-            self,
-            ring_end_m=growth * self.ring_end_m,
-            side_m=growth * self.side_m,
-            tilt_rad=float(np.sqrt(self.tilt_rad**2 + excess / BOARD_LEVER_M**2)),
-            depth_m=float(np.sqrt(self.depth_m**2 + excess)),
-            plane_m=plane_m,
-            edge_m=edge_m,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +28,8 @@ class SensorModel:
         pattern, width_rad: how its beams sweep the field of view, and its width; as `DataSheet` has them.
         limits: the profile's, on what a capture must show.
         target_sigma_rad, target_sigma_m: how well the extrinsic is to be known.
-        errors: how both measure.
+        priors, levels: of the likelihood's constant errors and noise; levels are learned from captures.
+        inflation: factor by which the calibration of these captures widens its covariance, as they scatter.
     """
 
     board: Board
@@ -103,7 +39,9 @@ class SensorModel:
     limits: QualitySettings
     target_sigma_rad: float
     target_sigma_m: float
-    errors: ErrorModel = field(default_factory=ErrorModel)
+    priors: Priors = field(default_factory=Priors)
+    levels: Levels = field(default_factory=Levels)
+    inflation: float = 1.0
     pattern: str = "rings"
     width_rad: float = 2 * np.pi
 
@@ -122,9 +60,11 @@ class SensorModel:
                 f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
                 f"set elevations_deg, collect without guidance, or use one of {names}",
             )
-        offset_m = settings.range_offset_sigma_m
-        if not settings.has_rings:
-            offset_m = min(offset_m, _OUTLINED_OFFSET_M)
+        tolerances = Tolerances.of(rig.cameras[camera], rig.board)
+        options = EstimateSettings.of(CalibrateOptions(), settings, tolerances)
+        priors, levels = what_is_known(options)
+        if options.known is not None:
+            priors, levels = _as_measured(priors, levels, options.known)
         return cls(
             board=rig.board.to_board(),
             lens=rig.cameras[camera].to_intrinsics(),
@@ -133,14 +73,26 @@ class SensorModel:
             limits=rig.quality,
             target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
             target_sigma_m=rig.calibration.target_sigma_m,
-            errors=ErrorModel(
-                range_m=sheet.range_sigma_m,
-                laser_bias_m=settings.laser_bias_sigma_m,
-                range_offset_m=offset_m,
-            ),
+            priors=priors,
+            levels=replace(levels, range_m=sheet.range_sigma_m, laser_m=max(levels.laser_m, NO_LASER_M)),
             pattern=sheet.pattern,
             width_rad=float(np.radians(sheet.fov_deg[0])),
         )
+
+
+def _as_measured(priors: Priors, levels: Levels, known: KnownLidar) -> tuple[Priors, Levels]:
+    """Replace priors of a LiDAR's errors by the mean deviations of those that were measured before."""
+    range_m, azimuth_rad, elevation_rad = np.sqrt(np.mean(known.lasers_sigma**2, axis=1)).tolist()
+    lateral_m, vertical_m = known.lens_sigma.tolist()
+    measured = replace(
+        priors,
+        known=None,
+        azimuth_rad=azimuth_rad,
+        elevation_rad=elevation_rad,
+        lateral_m=lateral_m,
+        vertical_m=vertical_m,
+    )
+    return measured, replace(levels, laser_m=range_m)
 
 
 NEAREST_M = 1.2

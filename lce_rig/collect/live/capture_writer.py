@@ -9,7 +9,8 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.guidance.planner import Planner
 from lce_rig.collect.live.guide import Guide, make_guides
@@ -101,19 +102,22 @@ class _Teacher:
     """The object in the worker's process."""
 
     def __init__(self, rig: Rig) -> None:
-        self._board = rig.board.to_board()
+        self._rig, self._board = rig, rig.board.to_board()
         self._guides = make_guides(rig)
 
     def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
         """Calibrate one guide's sensors; None where more captures are needed."""
+        guide = self._guides[k]
+        tolerances = Tolerances.of(self._rig.cameras[guide.key[0]], self._rig.board)
+        settings = EstimateSettings.of(CalibrateOptions(), self._rig.lidars[guide.lidar], tolerances)
         try:
-            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper"))
+            estimate = fit_extrinsic(list(candidates), self._board, settings)
         except (NotEnoughDataError, np.linalg.LinAlgError):
             return None
-        figures = estimate.diagnostics
-        return self._guides[k].prepare(
-            estimate.T_cam_lidar, figures.fit_plane_rms_m, figures.fit_edge_rms_m, len(estimate.used)
-        )
+        if estimate.joint is None:
+            return None
+        levels, inflation = estimate.joint[0].levels, estimate.diagnostics.covariance_inflation
+        return guide.prepare(estimate.T_cam_lidar, levels, inflation)
 
 
 class CaptureWriter:

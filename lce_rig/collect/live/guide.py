@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.findings import (
     CALIBRATE_SAME_PLACEMENT,
@@ -134,20 +135,18 @@ class Guide:
         self._names, self._held = [self._names[k] for k in left], [self._held[k] for k in left]
         self.guidance = self._coverage = None
 
-    def prepare(
-        self, T_cam_lidar: Array, plane_rms_m: float, edge_rms_m: float, n_captures: int
-    ) -> Planner | None:
+    def prepare(self, T_cam_lidar: Array, levels: Levels, inflation: float) -> Planner | None:
         """Build a planner from a calibration of the captures; takes a second and changes nothing.
 
         Args:
             T_cam_lidar: (4, 4).
-            plane_rms_m, edge_rms_m: residuals.
-            n_captures: used by the calibration.
+            levels: of the noise, as estimated.
+            inflation: factor by which the scatter of the captures widened the covariance.
         """
         if self._model is None:
             return None
-        errors = self._model.errors.learned(plane_rms_m, edge_rms_m, n_captures)
-        return Planner(SensorPlace(replace(self._model, errors=errors), T_cam_lidar))
+        learned = replace(self._model, levels=levels, inflation=inflation)
+        return Planner(SensorPlace(learned, T_cam_lidar))
 
     def adopt(self, planner: Planner | None) -> None:
         """Take a planner from `prepare`; None to go back to the one before any capture."""
@@ -210,9 +209,9 @@ class Guide:
             self.key[0],
             n_more=guidance.n_more,
             n_least=guidance.n_least,
-            rotation_deg=guidance.stated_rotation_deg,
+            rotation_deg=guidance.bound_rotation_deg,
             limit_deg=ENOUGH_SHARE * self._target_deg,
-            position_mm=1000 * guidance.stated_translation_m,
+            position_mm=1000 * guidance.bound_translation_m,
             limit_mm=ENOUGH_SHARE * self._target_mm,
         )
 
@@ -224,9 +223,9 @@ class Guide:
         return GUIDE_PREDICTED(
             f"{self.key[0]}, {self.lidar}",
             n_captures=guidance.n_captures,
-            rotation_deg=guidance.stated_rotation_deg,
+            rotation_deg=guidance.bound_rotation_deg,
             target_deg=self._target_deg,
-            position_mm=1000 * guidance.stated_translation_m,
+            position_mm=1000 * guidance.bound_translation_m,
             target_mm=self._target_mm,
             is_enough=guidance.is_enough,
         )

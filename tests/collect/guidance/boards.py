@@ -2,26 +2,15 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance.evidence import combine, weigh_placements
-from lce_rig.collect.guidance.sensor_model import ErrorModel, SensorModel, SensorPlace
+from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.collect.guidance.evidence import Predictor
+from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.geometry import invert
 from lce_rig.rig import QualitySettings
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board
 
-# What the simulator of boards has: white noise, no side of a board that is drawn by what stands behind it.
-SURROGATE = ErrorModel(
-    corner_px=0.1,
-    range_m=0.01,
-    ring_end_m=0.0,
-    side_m=0.0,
-    tilt_rad=0.0,
-    depth_m=0.0,
-    laser_bias_m=0.0,
-    range_offset_m=0.0,
-)
 
-
-def model(errors=None):
+def model(priors=None, levels=None):
     """Describe a VLP-16 and a camera before the board of the calibration's tests."""
     return SensorModel(
         board=BOARD,
@@ -31,13 +20,14 @@ def model(errors=None):
         limits=QualitySettings(),
         target_sigma_rad=float(np.radians(0.2)),
         target_sigma_m=0.01,
-        errors=errors or ErrorModel(),
+        priors=priors or Priors(),
+        levels=levels or Levels(),
     )
 
 
-def view(errors=None):
+def view():
     """Look along the LiDAR's x axis."""
-    return SensorPlace(model(errors), T_FORWARD)
+    return SensorPlace(model(), T_FORWARD)
 
 
 def placements(n, seed):
@@ -54,4 +44,5 @@ def placements(n, seed):
 
 def predict_covariance(model, T_cam_board, T_cam_lidar):
     """Predict the covariance (6, 6) of T_cam_lidar from boards at T_cam_board (N, 4, 4)."""
-    return combine(weigh_placements(model, T_cam_board, T_cam_lidar), model.errors).cov
+    predictor = Predictor(model, T_cam_lidar)
+    return predictor.combine(predictor.weigh(T_cam_board)).cov
