@@ -22,6 +22,7 @@ are stable; texts may change in any release.
 | `subject` | a sensor, a capture, a profile key or a file; "" where it is plain |
 | `figures` | by name with units (`_m`, `_deg`, `_s`, `_px`, `_mps`), *in italics* below; null if unknown |
 | `action_code` | which of several actions applies, listed below; "" for the usual one |
+| `follows` | code of the cause that explains this finding; "" for a cause. Resolve the cause first |
 | `text`, `action` | the same in words, with the command to type |
 
 Refused captures have `stage` and `cause` in place of `severity` and `text`; the code begins with the stage:

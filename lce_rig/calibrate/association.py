@@ -1,7 +1,7 @@
 """Diagnosis of captures whose image and scan do not belong together.
 
-Captures that disagree may all fit one rigid transform once images are mirrored, or are paired with other
-scans. These errors have nothing to do with lens, board or mounting, and are named before them.
+Captures that disagree may all fit one rigid transform after mirroring the images, or pairing them with other
+scans. These errors do not depend on lens, board or mounting, and are tested before them.
 """
 
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
-# Fewest captures, and their share, that must agree once a supposed error is undone: by chance few do.
+# Minimum number and fraction of captures that agree with a supposed error undone; few do by chance.
 _MIN_EXPLAINED, _SHARE = 5, 0.75
-# Fewest captures beside a consensus of others.
+# Minimum number of captures with an error beside a consensus of others.
 _MIN_OF_SOME = 2
 # Reflections of an image left to right and top to bottom, as factors of the camera's axes; of the board's.
 _MIRRORS = np.array([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, 1.0, 1.0]])
@@ -35,13 +35,13 @@ def find_association_error(
     """Find the error of association that explains captures without agreement.
 
     Args:
-        candidates: of each capture with the board in both sensors.
+        candidates: captures with the board in both sensors.
         board: its specification.
-        consensus: of these captures; None where they agree with no extrinsics.
+        consensus: of these captures; None if they agree on no extrinsics.
 
     Returns:
-        An error if most captures disagree and the same error explains them; where the others suffice for
-        extrinsics, a finding whose severity is by the share of captures concerned; None for no such error.
+        An error if most captures disagree and one error explains them. If the others suffice for extrinsics,
+        a finding with a severity by the fraction of captures concerned. None for no such error.
     """
     ordered = sorted(candidates, key=lambda item: item.capture)
     n_agreeing = len(consensus.observations) if consensus else 0
@@ -52,12 +52,12 @@ def find_association_error(
 
 
 def is_of_all(error: Finding) -> bool:
-    """Check whether an error concerns all captures, so that the few that agree agree by chance."""
+    """Check whether an error concerns all captures; a few then agree by chance."""
     return not error.figures.get("captures")
 
 
 def _of_all(ordered: Candidates, board: Board, n_agreeing: int) -> Finding | None:
-    """Find the error that all captures share: without it, most agree."""
+    """Find the error common to all captures: most agree with it undone."""
     supposed = {
         "mirrored": [_mirrored(item, _MIRRORS[0]) for item in ordered],
         "late": _paired(ordered[1:], ordered),
@@ -109,7 +109,7 @@ def _of_some(ordered: Candidates, consensus: Consensus) -> Finding | None:
 
 
 def _mirrored(item: Observation, mirror: Array) -> Observation:
-    """Reflect the board's poses in the image; in its plane the board is reflected, too."""
+    """Mirror the board's poses in the image, and the board in its plane."""
 
     def reflected(T_cam_board: Array) -> Array:
         return np.asarray(mirror[:, None] * T_cam_board * _IN_PLANE)
@@ -121,5 +121,5 @@ def _mirrored(item: Observation, mirror: Array) -> Observation:
 
 
 def _paired(images: Candidates, scans: Candidates) -> list[Observation]:
-    """Pair the images of some captures with the scans of others, one by one; the scan names the capture."""
+    """Pair images and scans of different captures one by one; the capture is that of the scan."""
     return [replace(scan, image=image.image) for image, scan in zip(images, scans, strict=False)]

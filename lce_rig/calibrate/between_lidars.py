@@ -27,7 +27,7 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.findings import FEW_AGREE, TURNED
-from lce_rig.calibrate.likelihood.fit import JointEstimate, fit_boards
+from lce_rig.calibrate.likelihood.fit import JointEstimate, fit_boards, maximise_likelihood
 from lce_rig.calibrate.likelihood.layout import OWN
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.likelihood.rays import lens_fields
@@ -35,7 +35,7 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
-from lce_rig.calibrate.uncertainty import laser_angles, widen
+from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import (
@@ -296,4 +296,6 @@ def _fit_poses(start: Start, one: PlacedBoards, other: PlacedBoards, board: Boar
     cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
     figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
     estimate = report(start, T, cov, board, figures)
-    return replace(estimate, method="ml", laser_angles=laser_angles(other.joint))
+    # The same boards as if the first LiDAR's poses were images: only to judge whether mountings changed.
+    joint = maximise_likelihood([start.observations], board, [T], other.joint.priors, other.joint.levels)
+    return replace(estimate, method="ml", joint=(joint, 0))

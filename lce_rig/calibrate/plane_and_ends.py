@@ -197,12 +197,12 @@ def end_rows(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, Array, NDAr
     """Linearise (2) for a capture's ring ends.
 
     Returns:
-        Values (M,), derivatives (M, 8) by tangent (6), shift d and scale s, and the edges' numbers (M,).
+        Values (M,), derivatives (M, 7) by tangent (6) and shift d, and the edges' numbers (M,).
     """
     inside_m, edge = end_residuals(f, T_cam_lidar)
     normals = f.edge_normals[edge]
     by_tangent = differentiate(normals, f.edge_points @ T_cam_lidar[:3, :3].T)
-    return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre]), edge
+    return inside_m, np.column_stack([by_tangent, np.ones(len(edge))]), edge
 
 
 def describe_background(lidar: LidarBoard) -> Array:
@@ -216,14 +216,3 @@ def describe_background(lidar: LidarBoard) -> Array:
     if lidar.edge_beam_m is not None:
         echo = echo * lidar.edge_beam_m.sum(axis=1) / _HALF_BEAM_M
     return np.stack([echo * ~blends, blends, echo * blends], axis=1)
-
-
-def freedoms_of_plane() -> Array:
-    """Differentiate the height of a board's points by the board's motion.
-
-    Returns:
-        K (3, 6): a point (x, y) of the board rises along its normal by (1, x, y) K times the tangent, in the
-        axes of the board and about its middle.
-    """
-    at = -differentiate(np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
-    return np.asarray(at - np.array([[0.0], [1], [1]]) * at[0])

@@ -10,8 +10,7 @@ from the scatter between captures follow from it. Errors are independent between
 between captures that repeat one.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -61,14 +60,6 @@ class Quadratics:
         """Compute (1) for all captures: (p,)."""
         return np.asarray(self.solve(np.ones((1, len(self.gradients))))[0])
 
-    def without_each(self) -> Array:
-        """Compute (1) without each of the placements: (G, p).
-
-        The inverse of H - H_k and not of H corrects for the pull that each placement has on its own
-        residuals, which matters for few of them.
-        """
-        return self.solve(1 - self.groups)
-
     def moves(self) -> Array:
         """Compute the leave-one-out shifts of an estimate at the optimum for each placement: (G, p).
 
@@ -102,31 +93,6 @@ class Quadratics:
         n_groups, p = len(self.groups), len(self.prior)
         correction = (n_groups - 1) / max(n_groups - p - 2, 2)
         return np.asarray(correction * jackknife_scatter(self.moves()))
-
-    def hold(self, unknowns: Sequence[int]) -> "Quadratics":
-        """Hold some unknowns fixed: quadratics in the others."""
-        return self.of(np.delete(np.arange(len(self.prior)), unknowns))
-
-    def of(self, unknowns: NDArray[np.intp]) -> "Quadratics":
-        """Hold all unknowns but these, by index, fixed."""
-        return replace(
-            self,
-            gradients=self.gradients[:, unknowns],
-            hessians=self.hessians[:, unknowns[:, None], unknowns],
-            prior=self.prior[unknowns[:, None], unknowns],
-            prior_gradient=self.prior_gradient[unknowns],
-        )
-
-    def settled(self) -> "Quadratics":
-        """Hold all unknowns but the first six at their optimum: quadratics in these, about it."""
-        x = self.optimum()
-        return replace(
-            self,
-            gradients=(self.gradients + self.hessians @ x)[:, :6],
-            hessians=self.hessians[:, :6, :6],
-            prior=np.zeros((6, 6)),
-            prior_gradient=np.zeros(6),
-        )
 
 
 def without_prior(gradients: Array, hessians: Array, placement: NDArray[np.intp]) -> Quadratics:

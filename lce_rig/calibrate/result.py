@@ -78,9 +78,6 @@ class CalibrationEstimate:
         method: that found it, as `CalibrateOptions.method`.
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
-        turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
-            its standard deviation at usual noise, both by the likelihood; None without it.
-        laser_angles: rms error of the lasers' azimuths and elevations, deg, as `uncertainty.laser_angles`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
@@ -101,8 +98,6 @@ class CalibrationEstimate:
     diagnostics: Diagnostics
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
-    turns: Array | None = None
-    laser_angles: Mapping[str, float] = field(default_factory=dict)
     lens: SessionLens | None = None
     cov_with_lens: Array = field(default_factory=lambda: np.zeros((6, 0)))
     joint: tuple[JointEstimate, int] | None = None

@@ -91,9 +91,12 @@ def calibrate_together(
     for k, (name, start) in enumerate(zip(names, starts, strict=True)):
         own = alone[name]
         estimate = by_likelihood(start, joint, board, own.lens, k)
+        of_scan = {scan_key(o): o.capture for o in start.observations}
+        names_here = tuple(of_scan.get(key, "") for key in scans)
         scales.append(np.full(6, np.sqrt(estimate.diagnostics.covariance_inflation)))
         estimates[name] = replace(
             estimate,
+            joint=(replace(joint, captures=names_here), k),
             estimated_with=tuple(other for other in names if other != name),
             same_scan=own.same_scan,
             channels=own.channels,

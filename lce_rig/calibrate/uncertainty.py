@@ -8,9 +8,7 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.images import stack_images
-from lce_rig.calibrate.likelihood.layout import LASER, SHIFTS
-from lce_rig.calibrate.likelihood.levels import Levels
-from lce_rig.calibrate.likelihood.model import assemble
+from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
 from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
@@ -18,12 +16,10 @@ from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, re
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
-from lce_rig.core.geometry import Array, chance_of, invert, transform
+from lce_rig.core.geometry import Array, invert, transform
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
-# Angles of lasers with a loose prior, and the chance below which they are not those of the scans.
-_LOOSE_RAD, _CHANCE = np.radians(1.0), 1e-4
 
 
 def by_scatter(
@@ -61,8 +57,6 @@ def by_scatter(
         estimate,
         fitted={observation.capture: observation for observation in start.fitted},
         sensitivities=sensitivities,
-        turns=_turns(joint),
-        laser_angles=laser_angles(joint),
         lens=settings.lens,
         cov_with_lens=cov_with_lens,
         joint=(joint, 0),
@@ -105,7 +99,7 @@ def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array
         J[:, :6] = differentiate(f.normal, points @ T[:3, :3].T)
         by_lift = -weights.plane / max(len(points), 1) * J.T @ _one_x_y(T_board_lidar, points)
         _, J_end, edge = end_rows(f, T)
-        J_end = weights.edge / max(len(edge), 1) * J_end[:, :7]
+        J_end *= weights.edge / max(len(edge), 1)
         outwards = np.sum(f.edge_normals[edge] * (f.edge_points @ T[:3, :3].T), axis=1)
         sideways = (outwards / (f.edge_points @ normal))[:, None]
         by_lift -= J_end.T @ (sideways * _one_x_y(T_board_lidar, f.edge_points))
@@ -216,66 +210,10 @@ def by_likelihood(
         estimate,
         method="ml",
         sensitivities=tuple(Sensitivity(name, 1.0, (J @ moves).T) for name, moves in joint.moves.items()),
-        turns=_turns(joint, camera),
-        laser_angles=laser_angles(joint),
         lens=lens,
         cov_with_lens=joint.cov_with_lens(camera),
         joint=(joint, camera),
     )
-
-
-def _turns(joint: JointEstimate, camera: int = 0) -> Array:
-    """Measure the turn about its line of sight of each board that a camera sees: `CalibrationEstimate.turns`.
-
-    The noise of such turns, as estimated, contains those of a sensor that moves to and fro, and captures of
-    either mounting lose weight: the usual noise is assumed, and full weight.
-    """
-    images, layout = joint.terms.images[camera], joint.state.layout
-    levels = replace(joint.levels, spin_rad=Levels().spin_rad)
-    terms = replace(joint.terms, trust=np.ones_like(joint.terms.trust))
-    cost = assemble(terms, levels, joint.priors).cost.of(layout.camera(camera))
-    # A board may leave a direction undetermined: 1 m, 1 rad.
-    cov = np.linalg.inv(cost.hessians[images.capture] + np.eye(6))
-    own = -(cov @ cost.gradients[images.capture, :, None])[:, 3:, 0]
-    sight = images.T_cam_board[:, :3, 3] / np.linalg.norm(images.T_cam_board[:, :3, 3], axis=1, keepdims=True)
-    variance = np.einsum("fi,fij,fj->f", sight, cov[:, 3:, 3:], sight)
-    return np.array([np.sum(sight * own, axis=1), np.sqrt(variance)])
-
-
-def laser_angles(joint: JointEstimate) -> dict[str, float]:
-    """Estimate how far the lasers' angles are from the scans', beyond their noise.
-
-    Another model or beam table turns rays by more than the likelihood's prior P allows, which holds angles x
-    near their mean m. To first order, a loose one P' in its place gives
-
-        x' = x - (H - P + P')^-1 (P' x - P (x - m))
-
-    with H the information of all unknowns at the optimum.
-
-    Returns:
-        Rms over rings of the errors about their mean in deg, by "azimuth" and "elevation": the noise is
-        subtracted, rings count by their information; 0 where noise alone explains them. None without rings.
-    """
-    cost, z, layout = joint.cost, joint.state.z, joint.state.layout
-    if layout.n_rings < 2:
-        return {}
-    of_angles = layout.lasers[1:].ravel()
-    information, gradient = cost.information.copy(), np.zeros(len(z))
-    information[of_angles[:, None], of_angles] -= cost.prior[of_angles[:, None], of_angles]
-    information[of_angles, of_angles] += _LOOSE_RAD**-2
-    gradient[of_angles] = z[of_angles] / _LOOSE_RAD**2 - cost.prior_gradient[of_angles]
-    cov = np.linalg.inv(information)
-    x = z - cov @ gradient
-    sizes = {}
-    for name, at in zip(LASER[1:], layout.lasers[1:], strict=True):
-        own = cov[at[:, None], at]
-        weights = 1 / np.diag(own)
-        about_mean = np.eye(len(at)) - weights / weights.sum()
-        errors, variances = about_mean @ x[at], np.diag(about_mean @ own @ about_mean.T)
-        is_sure = chance_of(float(x[at] @ np.linalg.solve(own, x[at])), len(at)) < _CHANCE
-        excess = np.average(errors**2 - variances, weights=variances**-2.0) if is_sure else 0.0
-        sizes[name] = float(np.degrees(np.sqrt(max(excess, 0.0))))
-    return sizes
 
 
 def _add_figures(start: Diagnostics, joint: JointEstimate, inflation: float) -> Diagnostics:

@@ -25,7 +25,7 @@ from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
-from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures
+from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -33,7 +33,14 @@ from lce_rig.show.tables import result_tables
 
 _AXES = ("x right", "y down", "z forward")
 _AXES_OF_LIDAR = ("x forward", "y left", "z up")
-_CORRECTED = {"verdict.intrinsics", "verdict.scale"}
+_CORRECTED = {
+    "verdict.intrinsics",
+    "verdict.scale",
+    "verdict.range_offset",
+    "verdict.range_scale",
+    "verdict.laser_angles",
+    "verdict.plate_size",
+}
 # Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
 _N_REASONS, _FAR_M = 3, 10.0
 
@@ -269,7 +276,7 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
 def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested."""
     colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"
-    following, causes = consequences(c.findings), causes_of(c.findings)
+    causes = causes_of(c.findings)
     used = f"{len(c.captures_used)} of {c.n_captures} captures used"
     yield f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
@@ -277,13 +284,17 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     n_shown = _N_REASONS if len(causes) <= _N_REASONS else _N_REASONS - 1
     advised: set[str] = set()
     for finding in c.findings if is_explained else causes[:n_shown]:
-        follows = "follows: " if finding.code in following else ""
+        follows = "follows: " if finding.follows else ""
         tint = "none" if finding.severity == "note" else colour
         yield f"  [{tint}]{follows}{show.escape(finding.text)}[/]"
         advice = "" if follows else advice_of(finding, plan, path)
         if advice and advice not in advised:
             yield f"    -> {show.escape(advice)}"
             advised.add(advice)
+    following = [finding for finding in c.findings if finding.follows]
+    if following and not is_explained:
+        more = f"; {len(following) - 1} more" if len(following) > 1 else ""
+        yield f"    follows: {show.escape(following[0].text)}{more}"
     if plan and not lacks_captures(causes[:1]):
         yield f"  -> {plan}"
     if len(causes) > n_shown and not is_explained:

@@ -85,6 +85,7 @@ class Finding:
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
         figures: by name with units ("rms_m"), for the words and for programs.
         action: the name of an alternative action of the kind; "" for the usual one.
+        follows: the code of the finding that this one follows from; "" for a cause.
         stored: text and action as read from a file; None renders the kind's own.
     """
 
@@ -93,6 +94,7 @@ class Finding:
     subject: str = ""
     figures: Mapping[str, Figure] = field(default_factory=dict)
     action: str = ""
+    follows: str = ""
     stored: tuple[str, str] | None = field(default=None, compare=False)
 
     @property
@@ -147,6 +149,7 @@ class Finding:
             "subject": self.subject,
             "figures": {name: _finite(figure) for name, figure in self.figures.items()},
             "action_code": self.action,
+            "follows": self.follows,
             "text": self.text,
             "action": self.advice,
         }

@@ -1,7 +1,7 @@
-"""The point in which the cones of a spinning LiDAR's rings meet.
+"""The common apex of the cones that a spinning LiDAR's lasers sweep.
 
-Each laser sweeps a cone about the rotor's axis. Seen from the apex, the returns of one ring share one
-elevation. Seen from elsewhere, near returns have another elevation than far ones.
+Each laser sweeps a cone about the rotor's axis. Seen from the apex, the returns of a ring have the same
+elevation. Seen from elsewhere, the elevation of near returns differs from that of far ones.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array, exp_so3
 
-# Noise of a return's elevation: of the beam's angle, and of where in the sensor the beam begins.
+# Noise of a return's elevation: of the beam's angle, rad, and of its origin in the sensor, m.
 _SIGMA_RAD, _SIGMA_M = np.radians(0.1), 0.01
-# Returns that are used, drawn at random: the estimate takes 5 ms, and its error stays below 1 cm.
+# Number of random returns that are used: the estimate takes 5 ms, and its error stays below 1 cm.
 _N_POINTS = 2000
 _MIN_RINGS, _MIN_POINTS = 4, 200
 _MIN_DISTANCE_M = 0.05
@@ -22,14 +22,14 @@ _MAX_STEPS, _CONVERGED = 40, 1e-4
 _LONGEST_STEP = np.repeat([0.5, 0.1], [3, 2])
 # Huber's constant, in robust standard deviations.
 _HUBER = 2.5
-# First steps, in which no return is an outlier: about the frame's origin all may look like one.
+# Number of first steps without outliers: about the frame's origin every return may look like one.
 _PLAIN_STEPS = 5
-# Elevations must scatter by this factor more about the frame's origin than about another apex.
+# Minimum ratio of the elevations' scatter about the frame's origin to that about another apex.
 _MIN_RATIO = 2.0
 _SIGNIFICANT = 5.0
 MAX_APEX_M = 0.1
-"""Farthest apex of a scan in its LiDAR's own frame: 37 mm on an Ouster OS1, whose frame lies at its base, and
-below 1 mm on nine other recordings. Errors of the extrinsics grow with this distance."""
+"""Largest distance of the apex from the origin in a LiDAR's own frame: an Ouster OS1, with its frame at the
+base, has 37 mm, nine other recordings have below 1 mm. Errors of the extrinsics grow with this distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Apex:
     Attributes:
         position_m: (3,) in the frame of the points.
         sigma_m: largest standard deviation of the position.
-        rms_rad: scatter of the elevations of a ring about the apex.
+        rms_rad: scatter of a ring's elevations, seen from the apex.
         rms_at_origin_rad: the same about the frame's origin.
     """
 
@@ -56,14 +56,14 @@ class Apex:
 
 
 def find_apex(points: NDArray[np.float32], ring: NDArray[np.int16]) -> Apex | None:
-    """Fit apex and axis of the rings of one scan, robustly; elevations of the lasers are free.
+    """Fit apex and axis of the rings of one scan robustly, with free elevations of the lasers.
 
     Args:
         points: (N, 3) m, in any frame.
         ring: (N,) laser of each point.
 
     Returns:
-        None if the points are too few, or do not determine the apex.
+        None if there are too few points, or they do not determine the apex.
     """
     if len(points) > _N_POINTS:
         drawn = np.random.default_rng(0).integers(0, len(points), _N_POINTS)
@@ -80,7 +80,7 @@ def find_apex(points: NDArray[np.float32], ring: NDArray[np.int16]) -> Apex | No
         outward = local[:, :2] / flat_m[:, None]
         sine, cosine = local[:, 2] / range_m, flat_m / range_m
         sigma = np.hypot(_SIGMA_RAD, _SIGMA_M / range_m)
-        # Derivatives of the elevation with respect to the apex, and to turns of the axis about x and y.
+        # Derivatives of the elevation by the apex, and by rotations of the axis about x and y.
         of_apex = np.column_stack([sine[:, None] * outward, -cosine]) @ to_axis / range_m[:, None]
         J = np.column_stack([of_apex, outward])
         elevation = np.arctan2(local[:, 2], flat_m)
@@ -103,7 +103,7 @@ def find_apex(points: NDArray[np.float32], ring: NDArray[np.int16]) -> Apex | No
         to_axis = exp_so3(np.array([change[4], -change[3], 0.0])) @ to_axis
     else:
         return None
-    # Errors of returns, not of the a-priori noise: a scan of exact beams determines its apex exactly.
+    # Scaled by the actual errors: a scan of exact beams determines its apex exactly.
     cov = np.linalg.inv(normal) * max(float(np.average((error / sigma) ** 2, weights=soft)), 1e-6)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
     return Apex(apex, sigma_m, rms, float(rms_at_origin or 0.0))

@@ -1,14 +1,13 @@
-"""The reported covariance: what the captures show, what the profile may have wrong, what checks contradict.
+"""The reported covariance: scatter of the captures, errors of the profile, and contradictions.
 
     cov = cov_session + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
 
-with S_i the sensitivity to error i of the profile's lens or board, and m_c the move of the extrinsics that
-would resolve contradiction c: a check that finds something else than the profile says, beyond both standard
-deviations, widens the claim until it holds both.
+with S_i the sensitivity to error i of the profile's lens or board, and m_c the displacement of the extrinsics
+that would resolve contradiction c. The reported covariance then covers the extrinsics with and without it.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import get_args
 
 import numpy as np
@@ -17,12 +16,9 @@ from lce_rig.calibrate.options import Source
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
 from lce_rig.core.calibration import Contribution, Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.judge.split_consistency import Contrast, objections
-from lce_rig.rig import Rig
+from lce_rig.rig import CalibrationSettings
 
-# Scales differ significantly beyond this many standard deviations.
-_SURE = 3.0
-# Two subsets of the captures that contradict each other: the result is the mean of both.
+# Part of the difference of two channels that counts: the result lies between both.
 _HALF = 0.5
 _CONTRADICTION = "contradiction_"
 
@@ -32,40 +28,12 @@ def summed_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
     return np.asarray(sum((each.covariance() for each in sensitivities), np.zeros((6, 6))))
 
 
-def find_contradictions(
-    estimate: CalibrationEstimate,
-    scale: tuple[float, float] | None,
-    pattern: tuple[Array, Array] | None,
-    contrasts: Sequence[Contrast],
-    rig: Rig,
-) -> Iterator[Sensitivity]:
-    """List the checks that contradict an estimate, each with the move of the extrinsics that resolves it.
-
-    Args:
-        estimate: with the sensitivities to errors of the profile.
-        scale: of the camera's distances, with its standard deviation.
-        pattern: (2,) offset from its place on the plate that contradicts the profile, with its covariance.
-        contrasts: subsets of the captures that should agree.
-        rig: targets and limits.
-    """
-    target, of_source = rig.calibration, {each.source: each for each in estimate.sensitivities}
-    # The likelihood weighs the camera's distances and the LiDAR's itself.
-    if of_source and scale is not None and estimate.method == "paper" and estimate.lens is not None:
-        squares = of_source["square_size"]
-        variance = scale[1] ** 2 + squares.sigma**2 + estimate.lens.focal_sigma**2
-        if scale[0] ** 2 > _SURE**2 * variance:
-            yield Sensitivity("scale", 1.0, scale[0] * squares.moves)
-    if of_source and pattern is not None:
-        yield Sensitivity("pattern", 1.0, pattern[0][None] @ of_source["pattern_offset"].moves)
-    for contrast in objections(contrasts, target):
-        # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
-        # from one of the two that may hold now.
-        share = 1.0 if contrast.is_change else _HALF
-        yield Sensitivity(f"{contrast.first}_{contrast.second}", 1.0, share * contrast.apart[None])
-    # Channels of one camera have one pose: the result lies between both.
+def channels_contradict(estimate: CalibrationEstimate, target: CalibrationSettings) -> list[Sensitivity]:
+    """Return the displacement of channels of one camera that differ; their common pose lies between both."""
     apart = estimate.channel_difference
-    if apart is not None and target.excess(apart) > 1:
-        yield Sensitivity("channels", 1.0, _HALF * apart.tangent[None])
+    if apart is None or target.excess(apart) <= 1:
+        return []
+    return [Sensitivity("channels", 1.0, _HALF * apart.tangent[None])]
 
 
 def list_contributions(
@@ -89,13 +57,13 @@ def list_contributions(
 
 
 def largest(causes: Sequence[Contribution], size: str) -> str:
-    """Name the cause with the largest `sigma_rotation_deg` or `sigma_translation_m`; "" if none is known."""
+    """Return the source of the largest `sigma_rotation_deg` or `sigma_translation_m`; "" if unknown."""
     known = [each for each in causes if math.isfinite(getattr(each, size))]
     return max(known, key=lambda each: float(getattr(each, size))).source if known else ""
 
 
 def measure_action(source: str) -> str:
-    """Return the action of a finding against a cause; "" if more captures reduce it."""
+    """Return the action against a source of uncertainty; "" if more captures reduce it."""
     if source.startswith(_CONTRADICTION):
         return "resolve"
     return f"measure_{source}" if source in get_args(Source) else ""

@@ -1,37 +1,38 @@
-"""What explains the captures but their noise: a table of explanations on the estimate's own likelihood.
+"""Score tests of errors that may explain the captures, on the estimate's own likelihood.
 
 The likelihood (`calibrate.likelihood.hypothesis`) is expanded to second order at its optimum. An explanation
-adds unknowns s to the unknowns z that all captures share: capture k is seen with
+adds unknowns s to the unknowns z that all captures share. Capture k is then seen with
 
     z + w_k D s                                                                                          (1)
 
-A constant error has w_k = 1 and D the columns of its unknowns: s has no prior, so that the error is freed of
-the profile's. A sensor that moved has D the columns of the extrinsics, and w_k = 1 for the later captures.
-With g_k and H_k half the gradient and half the Hessian of the captures' costs, H that of all with the priors
-and g its gradient, the cost falls by
+A constant error has w_k = 1, and D selects its unknowns. s has no prior, which frees the error of the
+profile's. For a sensor that moved, D selects the extrinsics, and w_k = 1 for the captures on one side. With
+g_k and H_k half the gradient and half the Hessian of the captures' costs, g and H those of all captures with
+the priors, the cost falls by
 
     chi2 = h^T S^-1 h,    h = g_s - H_sz H^-1 g,    S = H_ss - H_sz H^-1 H_zs,
     g_s = sum_k w_k D^T g_k,    H_sz = sum_k w_k D^T H_k,    H_ss = sum_k w_k^2 D^T H_k D                 (2)
 
 which is chi-squared without the error. The most significant explanation is assumed, the likelihood settles
-under it, and the others are tested again, until none is significant. What is no longer significant then
-follows from what was assumed. Larger errors of the images than usual explain captures that disagree, too: an
-explanation is assumed if the likelihood is significantly larger with it where these are fitted in both cases.
+under it, and the others are tested again, until none is significant. Explanations that lose their
+significance on the way followed from the assumed one. Noisier images than usual also explain captures that
+disagree. An explanation is therefore assumed only if it raises the likelihood significantly with the noise of
+the images fitted in both cases.
 
 References:
     Rao, "Large sample tests of statistical hypotheses", 1948 (the score test).
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.likelihood.layout import Indices
-from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels  # noqa
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.geometry import Array, difference, perturb
 
@@ -51,12 +52,18 @@ Cause = Literal[
     "alone",
     "drift",
     "focus_drift",
+    "two_boards",
 ]
-
-# Logarithm of the probability below which an explanation is significant, among all of its kind.
+MOUNTINGS: tuple[Cause, ...] = ("moved", "groups", "alone", "drift")
+"""Causes that change the extrinsics during the session."""
+# Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried.
 _LEAST = -4.0
-# Deviations of constant errors that are freed of their priors: as large as a user may bring about.
-_FREED: dict[Cause, dict[str, Any]] = {
+# The same of explanations that are settled. Ring ends far from their edges count as strays, and (2)
+# understates what explains them: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
+# settled -146.
+_TRIED = -2.0
+# Prior standard deviations of freed constant errors: the size of users' mistakes.
+_FREED: Mapping[Cause, Mapping[str, Any]] = {
     "squares": {"squares": 0.2},
     "pattern": {"pattern_m": 0.2},
     "plate": {"plate_m": 0.2},
@@ -68,56 +75,55 @@ _FREED: dict[Cause, dict[str, Any]] = {
     "azimuths": {"azimuth_rad": 0.1, "known": None},
     "elevations": {"elevation_rad": 0.1, "known": None},
 }
-# Deviation of a change of the extrinsics, m and rad.
-_CHANGE = 1.0
+_OF_SQUARES: tuple[Cause, ...] = ("focus_drift", "two_boards")
+ALL: tuple[Cause, ...] = (*_FREED, *_OF_SQUARES, *MOUNTINGS)
+# Standard deviation of other unknowns: changes of the extrinsics, m and rad, and of the scale.
+_ANY = 1.0
+# Handicap of the rarer of two errors that only the plate's size separates, log10 of the probability: ranges
+# too long by a fraction look like squares larger than the profile's. On rlfs02, ranges of 2 % prefer the
+# right cause by 9, squares of 3 % the wrong one by 4.
+_RARER: Mapping[Cause, float] = {"range_scale": 8.0}
+_ALIKE: Sequence[Sequence[Cause]] = (MOUNTINGS, ("squares", "range_scale"), _OF_SQUARES)
+# Similar causes are settled, too, from this fraction of the best one's log10 of the probability.
+_LIKELY = 0.2
+SCATTER = 4.0
+"""Limit of the images' noise, in usual levels, above which no constant error explains the captures.
+
+It is two standard deviations of the prior of these levels."""
+# The same for changes of the mounting. Errors of boards that moved have long tails: setting any part of them
+# aside improves the fit of the rest. Each channel of rles01 and rles02 alone scatters 3 to 11 times as usual
+# and seems to have moved, both together 2.5 times.
+_MOVING = 3.0
 _FEWEST_IN_GROUPS, _FEWEST_AT_END, _FEWEST_OF_GROUP = 8, 2, 3
-_MOST = 8
+_MOST, _N_REJECTED = 4, 3
 _N_STARTS, _N_ROUNDS = 24, 10
-
-
-class Columns(NamedTuple):
-    """Derivatives of the captures' costs by n unknowns s of (1), with w_k.
-
-    Attributes:
-        gradient: (n,) g_s.
-        by_z: (G, n) H_zs.
-        hessian: (n, n) H_ss.
-    """
-
-    gradient: Array
-    by_z: Array
-    hessian: Array
+_MEDIAN_CHI2 = 5.348  # of six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A cause that may explain what captures disagree on.
+    """A cause that may explain why captures disagree.
 
     Attributes:
         cause: its kind.
-        weights: (F,) w of (1); None for 1.
-        n_tried: how many of its kind are tried.
-        cut: of "moved", the index of the first capture after it.
+        weights: (F,) w of (1).
+        n_tried: number of explanations of this kind.
+        cut: index of the first capture after a move ("moved"), or of another board ("two_boards").
     """
 
     cause: Cause
-    weights: Array | None = None
+    weights: Array
     n_tried: float = 1.0
-    cut: int | None = None
-
-    @property
-    def is_of_mounting(self) -> bool:
-        """Whether the extrinsics change."""
-        return self.cause in ("moved", "groups", "alone", "drift")
+    cut: int = 0
 
 
 class Gain(NamedTuple):
-    """What an explanation explains.
+    """The fall of the cost by an explanation, and its significance.
 
     Attributes:
         explanation: the explanation.
-        log10_chance: of a fall of the cost of this size without the error, in one of those tried.
-        freedoms: of its distribution.
+        log10_chance: log10 of the probability of such a fall without the error, in any of those tried.
+        freedoms: degrees of freedom of its chi-squared.
         value: (n,) estimate of s.
     """
 
@@ -126,15 +132,20 @@ class Gain(NamedTuple):
     freedoms: int
     value: Array
 
+    @property
+    def cause(self) -> Cause:
+        """Of the explanation."""
+        return self.explanation.cause
+
 
 class Selected(NamedTuple):
     """An explanation that was assumed.
 
     Attributes:
-        gain: when it was.
-        change: (6,) tangent (translation m, rotation rad) by which it changes the extrinsics in use; of a
-            mounting, from one to the other.
-        after: the likelihood under it.
+        gain: its significance and estimate.
+        change: (6,) tangent (translation m, rotation rad) by which it changes the extrinsics. For mountings:
+            from before to after, or from the rest to the group.
+        after: the likelihood with it.
     """
 
     gain: Gain
@@ -142,21 +153,105 @@ class Selected(NamedTuple):
     after: Hypothesis
 
 
+class Poses(NamedTuple):
+    """Derivatives of F captures' costs by the extrinsics of their mounting, at the optimum of all.
+
+    Attributes:
+        gradient: (F, 6).
+        by_z: (F, G, 6).
+        hessian: (F, 6, 6).
+        inverse: (G, G) covariance of z.
+    """
+
+    gradient: Array
+    by_z: Array
+    hessian: Array
+    inverse: Array
+
+    def gain(self, explanation: Explanation, unit: float = 1.0) -> Gain:
+        """Compute (2) for a change of the extrinsics, in units of the captures' noise."""
+        w = explanation.weights
+        by_z = np.tensordot(w, self.by_z, axes=1)
+        hessian = np.tensordot(w**2, self.hessian, axes=1)
+        return _gain(explanation, w @ self.gradient, hessian - by_z.T @ self.inverse @ by_z, _ANY, unit)
+
+    def singles(self, gradient: Array) -> Array:
+        """Compute the fall of each capture's cost (F,) with extrinsics of its own: chi-squared, 6 freedoms.
+
+        Args:
+            gradient: (F, 6) at the optimum.
+        """
+        own = np.linalg.solve(self.hessian + 1e-9 * np.eye(6), gradient[..., None])[..., 0]
+        return np.asarray(np.einsum("ki,ki->k", gradient, own))
+
+    def without(self, weights: Array, by_z: Array, by_pose: Array) -> Array:
+        """Compute the gradients (F, 6) where an explanation is added.
+
+        Args:
+            weights: (F,) w.
+            by_z: (G,) H_zs s.
+            by_pose: (F, 6) derivatives of the captures' gradients, times s.
+        """
+        step = -self.inverse @ by_z
+        return np.asarray(
+            self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
+        )
+
+    def candidates(self) -> Iterator[Explanation]:
+        """List moves before each capture, single captures, the two groups that differ most, and a drift."""
+        F = len(self.gradient)
+        order, cuts = np.arange(F), range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1)
+        for cut in cuts:
+            # The smaller side gets the mounting of its own.
+            is_own = order < cut if 2 * cut < F else order >= cut
+            yield Explanation("moved", is_own.astype(np.float64), len(cuts), cut)
+        for k in order:
+            yield Explanation("alone", (order == k).astype(np.float64), F)
+        if F >= _FEWEST_IN_GROUPS and np.count_nonzero(np.diff(members := self.divide())) > 1:
+            yield Explanation("groups", members, 2.0 ** (F - 1))
+        yield Explanation("drift", order / max(F - 1, 1) - 0.5)
+
+    def divide(self) -> Array:
+        """Divide captures by k-means between the two extrinsics that fit them best: (F,) of 0 and 1."""
+        g, H, F = self.gradient, self.hessian, len(self.gradient)
+        starts = np.random.default_rng(0).random((_N_STARTS, F)) < 0.5
+        starts[0] = np.arange(F) % 2 == 0
+        best, members = -np.inf, starts[0]
+        for is_first in starts:
+            for _ in range(_N_ROUNDS):
+                shares = is_first.astype(np.float64)
+                costs = [self._costs(w @ g, np.tensordot(w, H, axes=1)) for w in (shares, 1 - shares)]
+                is_now = costs[0] < costs[1]
+                if min(is_now.sum(), (~is_now).sum()) < _FEWEST_OF_GROUP or (is_now == is_first).all():
+                    break
+                is_first = is_now
+            fall = -float(np.minimum(*costs).sum())
+            if fall > best:
+                best, members = fall, is_first
+        smaller = members if 2 * members.sum() <= F else ~members
+        return np.asarray(smaller, dtype=np.float64)
+
+    def _costs(self, g: Array, H: Array) -> Array:
+        """Compute each capture's cost (F,) at the minimum of a cost with gradient g and Hessian H."""
+        x = -np.linalg.solve(H + np.eye(6), g)
+        return np.asarray(2 * self.gradient @ x + np.einsum("i,kij,j->k", x, self.hessian, x))
+
+
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Explanations of one hypothesis' captures.
+    """Explanations of the captures, tested on one hypothesis.
 
     Attributes:
         hypothesis: the assumptions so far.
-        assumed: causes among them.
+        causes: the causes to test.
     """
 
     hypothesis: Hypothesis
-    assumed: frozenset[Cause] = field(default_factory=frozenset)
+    causes: frozenset[Cause]
 
     @cached_property
     def cost(self) -> Quadratics:
-        """Of the F captures, in z."""
+        """Expansion of the F captures' cost in z."""
         return self.hypothesis.reduced.cost
 
     @cached_property
@@ -168,30 +263,96 @@ class Table:
 
     @cached_property
     def step(self) -> Array:
-        """(G,) towards the optimum."""
+        """(G,) step from the expansion point to the optimum."""
         return np.asarray(-self.inverse @ self.hypothesis.reduced.gradient)
 
     @cached_property
-    def by_pose(self) -> tuple[Array, Array, Array]:
-        """Each capture's gradient (F, 6), and Hessians (F, G, 6), (F, 6, 6), by its mounting's extrinsics."""
-        at = self.hypothesis.state.layout.cameras[self.hypothesis.mounting]
+    def poses(self) -> Poses:
+        """Derivatives of the captures' costs by the extrinsics."""
+        c, at = self.cost, self.hypothesis.state.layout.cameras[self.hypothesis.mounting]
         F = np.arange(len(at))
-        c = self.cost
-        HD = np.swapaxes(c.hessians[F[:, None], at], 1, 2)
-        return c.gradients[F[:, None], at], HD, c.hessians[F[:, None, None], at[:, :, None], at[:, None]]
+        by_z = np.swapaxes(c.hessians[F[:, None], at], 1, 2)
+        hessian = c.hessians[F[:, None, None], at[:, :, None], at[:, None]]
+        gradient = c.gradients[F[:, None], at] + np.einsum("kga,g->ka", by_z, self.step)
+        return Poses(gradient, by_z, hessian, self.inverse)
 
-    def directions(self, cause: Cause) -> Array:
-        """Return the columns (G, n) of a constant error."""
+    def unit_without(self, row: Gain) -> float:
+        """Measure the noise of single captures under an explanation, in units of the usual noise."""
+        w, poses, s = row.explanation.weights, self.poses, row.value
+        if row.cause in MOUNTINGS:
+            by_z, by_pose = np.tensordot(w, poses.by_z, axes=1) @ s, poses.hessian @ s
+        else:
+            along = self._columns(row.cause) @ s
+            by_z = np.tensordot(w, self.cost.hessians, axes=1) @ along
+            by_pose = np.einsum("kga,g->ka", poses.by_z, along)
+        return _unit(poses.singles(poses.without(w, by_z, by_pose)))
+
+    def rows(self) -> list[Gain]:
+        """List the best explanation of each cause, the most significant first."""
+        best: dict[Cause, Gain] = {}
+        for explanation in self._candidates():
+            is_of_poses = explanation.cause in MOUNTINGS
+            found = self.poses.gain(explanation) if is_of_poses else self._gain(explanation)
+            held = best.get(explanation.cause)
+            if held is None or found.log10_chance < held.log10_chance:
+                best[explanation.cause] = found
+        return sorted(best.values(), key=lambda each: each.log10_chance)
+
+    def moves_of_rejected(self) -> list[Gain]:
+        """List the moves before the last captures or after the first, half of which the estimate rejected.
+
+        Far from the common optimum their cost is not quadratic, and (2) understates what they gain.
+        """
+        is_further, found = self.hypothesis.is_further, []
+        if "moved" not in self.causes or self.hypothesis.mounting.any():
+            return []
+        for explanation in self.poses.candidates():
+            members = explanation.weights > 0
+            if explanation.cause == "moved" and 2 * is_further[members].sum() >= members.sum():
+                found.append(self.poses.gain(explanation))
+        return sorted(found, key=lambda each: each.log10_chance)[:_N_REJECTED]
+
+    def moves_beside(self, row: Gain) -> list[Gain]:
+        """List the moves one capture before and after another one."""
+        cuts = {row.explanation.cut - 1, row.explanation.cut + 1}
+        near = [e for e in self.poses.candidates() if e.cause == "moved" and e.cut in cuts]
+        return [self.poses.gain(each) for each in near]
+
+    def _candidates(self) -> Iterator[Explanation]:
+        layout, F = self.hypothesis.state.layout, len(self.cost.gradients)
+        for cause in _FREED:
+            is_seen = {"lens": len(layout.optics(0)) > 0, "azimuths": layout.n_rings > 1}
+            is_seen["elevations"] = is_seen["azimuths"]
+            if cause in self.causes and is_seen.get(cause, True):
+                yield Explanation(cause, np.ones(F))
+        if "focus_drift" in self.causes:
+            yield Explanation("focus_drift", np.linspace(-0.5, 0.5, F))
+        cuts = range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1) if "two_boards" in self.causes else ()
+        for cut in cuts:
+            yield Explanation("two_boards", (np.arange(F) >= cut).astype(np.float64), len(cuts), cut)
+        yield from (each for each in self.poses.candidates() if each.cause in self.causes)
+
+    def _gain(self, explanation: Explanation) -> Gain:
+        """Compute (2) for a constant error."""
+        c, w, D = self.cost, explanation.weights, self._columns(explanation.cause)
+        sigma = next(iter(_FREED.get(explanation.cause, {"": _ANY}).values()))
+        by_z = np.tensordot(w, c.hessians, axes=1) @ D
+        hessian = D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D
+        h = D.T @ (w @ c.gradients) + by_z.T @ self.step
+        return _gain(explanation, h, hessian - by_z.T @ self.inverse @ by_z, sigma)
+
+    def _columns(self, cause: Cause) -> Array:
+        """Return D (G, n) of a constant error."""
         layout = self.hypothesis.state.layout
         every = np.eye(layout.z.size)
         if cause == "range_offset":
             return np.asarray(every[:, layout.lasers[0]].sum(axis=1, keepdims=True))
         if cause in ("azimuths", "elevations"):
-            # About their mean, which is part of the extrinsics.
+            # Deviations from their mean: the mean angle is part of the extrinsics.
             angles = layout.lasers[1 if cause == "azimuths" else 2]
             L = len(angles)
             return np.asarray(every[:, angles] @ np.linalg.svd(np.eye(L) - 1 / L)[0][:, :-1])
-        at: Indices = {
+        at: dict[Cause, Indices] = {
             "squares": layout.z.of(["squares"]),
             "pattern": layout.z.of(["pattern"]),
             "plate": layout.plate,
@@ -199,95 +360,28 @@ class Table:
             "lens": layout.optics(0),
             "range_scale": layout.z.of(["stretch"]),
             "range_contrast": layout.z.of(["contrast"]),
-            "focus_drift": layout.z.of(["squares"]),
-        }[cause]
-        return np.asarray(every[:, at])
+            **dict.fromkeys(_OF_SQUARES, layout.z.of(["squares"])),
+        }
+        return np.asarray(every[:, at[cause]])
 
-    def columns(self, explanation: Explanation) -> Columns:
-        """Return the derivatives by an explanation's unknowns."""
-        c, w = self.cost, explanation.weights
-        w = np.ones(len(c.gradients)) if w is None else w
-        if explanation.is_of_mounting:
-            g, HD, DHD = self.by_pose
-            return Columns(w @ g, np.tensordot(w, HD, axes=1), np.tensordot(w**2, DHD, axes=1))
-        D = self.directions(explanation.cause)
-        by_z = np.tensordot(w, c.hessians, axes=1) @ D
-        return Columns(D.T @ (w @ c.gradients), by_z, D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D)
 
-    def gain(self, explanation: Explanation) -> Gain:
-        """Compute (2)."""
-        columns = self.columns(explanation)
-        sigma = next(iter(_FREED.get(explanation.cause, {"": _CHANGE}).values()))
-        h = sigma * (columns.gradient + columns.by_z.T @ self.step)
-        S = columns.hessian - columns.by_z.T @ self.inverse @ columns.by_z
-        information, axes = np.linalg.eigh(sigma**2 * (S + S.T) / 2)
-        is_known = information > 1
-        along = (axes.T @ h)[is_known] / information[is_known]
-        chi2 = float(along**2 @ information[is_known])
-        chance = log10_chance(chi2, len(along)) + np.log10(explanation.n_tried)
-        return Gain(explanation, min(chance, 0.0), len(along), -sigma * axes[:, is_known] @ along)
+def _gain(explanation: Explanation, h: Array, S: Array, sigma: float, unit: float = 1.0) -> Gain:
+    """Compute (2) in the directions of s that captures determine better than its standard deviation."""
+    information, axes = np.linalg.eigh(sigma**2 * (S + S.T) / 2)
+    is_known = information > 1
+    along = sigma * (axes.T @ h)[is_known] / information[is_known]
+    chi2 = float(along**2 @ information[is_known]) / unit
+    chance = log10_chance(chi2, len(along)) + np.log10(explanation.n_tried)
+    return Gain(explanation, min(chance, 0.0), len(along), -sigma * axes[:, is_known] @ along)
 
-    def candidates(self) -> Iterator[Explanation]:
-        """List what is tried."""
-        layout, F = self.hypothesis.state.layout, len(self.cost.gradients)
-        for cause in _FREED.keys() - self.assumed:
-            if cause == "lens" and len(layout.optics(0)) == 0:
-                continue
-            if cause in ("azimuths", "elevations") and layout.n_rings < 2:
-                continue
-            yield Explanation(cause)
-        cuts = range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1)
-        order = np.arange(F)
-        for cut in cuts:
-            # The fewer captures are of a mounting of their own.
-            is_own = order < cut if 2 * cut < F else order >= cut
-            yield Explanation("moved", is_own.astype(np.float64), len(cuts), cut)
-        for k in order:
-            yield Explanation("alone", (order == k).astype(np.float64), F, int(k))
-        if F >= _FEWEST_IN_GROUPS and np.count_nonzero(np.diff(members := self.divide())) > 1:
-            yield Explanation("groups", members, 2.0 ** (F - 1))
-        middle = order / max(F - 1, 1) - 0.5
-        for cause in ("drift", "focus_drift"):
-            yield Explanation(cause, middle)
 
-    def divide(self) -> Array:
-        """Share captures out over two extrinsics that explain them best, by k-means: (F,) of 0 and 1."""
-        g, HD, H = self.by_pose
-        g = g + np.einsum("kga,g->ka", HD, self.step)
-        F, eye = len(g), np.eye(6)
-        starts = np.random.default_rng(0).random((_N_STARTS, F)) < 0.5
-        starts[0] = np.arange(F) % 2 == 0
-        best, members = -np.inf, starts[0]
-        for is_first in starts:
-            for _ in range(_N_ROUNDS):
-                x = [
-                    -np.linalg.solve(np.tensordot(w, H, 1) + eye, w @ g)
-                    for w in (is_first * 1.0, 1.0 - is_first)
-                ]
-                costs = [2 * g @ each + np.einsum("i,kij,j->k", each, H, each) for each in x]
-                is_now = costs[0] < costs[1]
-                if min(is_now.sum(), (~is_now).sum()) < _FEWEST_OF_GROUP or (is_now == is_first).all():
-                    break
-                is_first = is_now
-            fall = -float(np.minimum(*costs).sum())
-            if fall > best:
-                best, members = fall, is_first
-        smaller = members if 2 * members.sum() <= F else ~members
-        return np.asarray(smaller, dtype=np.float64)
-
-    def rows(self) -> list[Gain]:
-        """List the best explanation of each cause, the most significant first."""
-        best: dict[Cause, Gain] = {}
-        for explanation in self.candidates():
-            found = self.gain(explanation)
-            held = best.get(explanation.cause)
-            if held is None or found.log10_chance < held.log10_chance:
-                best[explanation.cause] = found
-        return sorted(best.values(), key=lambda each: each.log10_chance)
+def _unit(singles: Array) -> float:
+    """Estimate the captures' noise from the chi-squared of single captures (`Poses.singles`): at least 1."""
+    return max(float(np.median(singles)) / _MEDIAN_CHI2, 1.0)
 
 
 def log10_chance(chi2: float, freedoms: int) -> float:
-    """Compute the logarithm of the probability to exceed a chi-squared."""
+    """Return log10 of the probability of exceeding a chi-squared."""
     from scipy.special import chdtrc, gammaln
 
     if freedoms == 0:
@@ -299,67 +393,121 @@ def log10_chance(chi2: float, freedoms: int) -> float:
     return float((-half + (freedoms / 2 - 1) * np.log(half) - gammaln(freedoms / 2)) / np.log(10))
 
 
-def explain(hypothesis: Hypothesis) -> tuple[list[Selected], list[Gain]]:
+def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selected]:
     """Assume explanations until none is significant.
 
     Args:
         hypothesis: the assumptions of the estimate.
+        causes: the causes to test.
 
-    Returns:
-        The explanations assumed, and the table before any was.
+    Yields:
+        The explanations assumed, in order.
     """
-    selected: list[Selected] = []
-    first: list[Gain] = []
-    assumed: frozenset[Cause] = frozenset()
+    left = frozenset(causes)
     for _ in range(_MOST):
-        rows = Table(hypothesis, assumed).rows()
-        first = first or rows
-        if rows[0].log10_chance > _LEAST:
-            break
-        # Larger errors of the images explain captures that disagree, too.
+        table = Table(hypothesis, left)
+        rows, late = table.rows(), table.moves_of_rejected()
+        if not rows or (rows[0].log10_chance > _TRIED and not late):
+            return
         noisy = hypothesis.with_fitted_noise()
-        tried = {row.explanation.cause: row for row in (*Table(noisy, assumed).rows()[:1], rows[0])}
-        if rows[0].explanation.is_of_mounting:
-            tried |= {row.explanation.cause: row for row in rows if row.explanation.is_of_mounting}
-        best = min(
-            (_assume(hypothesis, noisy, row) for row in tried.values()),
-            key=lambda each: each.gain.log10_chance,
-        )
+        tried = [*Table(noisy, left).rows()[:1], rows[0], *late]
+        # Causes that are alike at usual noise: settled, one may be much more probable than the other.
+        alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
+        tried += [r for r in rows if r.cause in alike and r.log10_chance < _LIKELY * rows[0].log10_chance]
+        if rows[0].cause != "drift":
+            # A drift is not settled, and its probability is not that of the others.
+            tried = [row for row in tried if row.cause != "drift"]
+        tried += [near for row in tried if row.cause == "moved" for near in table.moves_beside(row)]
+        once = {(row.cause, row.explanation.cut): row for row in tried}
+        found = [_assume(hypothesis, noisy, row) for row in once.values()]
+        best = min(found, key=lambda each: each.gain.log10_chance + _RARER.get(each.gain.cause, 0.0))
         if best.gain.log10_chance > _LEAST:
-            break
-        selected.append(best)
-        hypothesis, assumed = best.after, assumed | {best.gain.explanation.cause}
-    return selected, first
+            return
+        yield best
+        if best.after is hypothesis:
+            return
+        hypothesis = best.after
+        if best.gain.cause not in MOUNTINGS:
+            left -= {best.gain.cause}
 
 
-def _assume(hypothesis: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
-    """Settle under an explanation, and compare deviances with noise that is fitted with and without it."""
-    after, change = assume(hypothesis, row)
-    fall = noisy.deviance - after.with_fitted_noise().deviance
+def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
+    """Settle under an explanation; compare deviances with noise fitted with and without it."""
+    if row.cause in _FREED:
+        after = now.under(priors=replace(now.priors, **_FREED[row.cause]))
+        change = difference(after.T_in_use, now.T_in_use)
+    elif row.cause in ("drift", *_OF_SQUARES):
+        # The likelihood has no such unknown: use its expansion and the noise of single captures.
+        unit = Table(now, frozenset()).unit_without(row)
+        chance = row.log10_chance / unit if unit < _MOVING**2 else 0.0
+        change = row.value if row.cause == "drift" else np.zeros(6)
+        if row.cause in _OF_SQUARES:
+            # Boards are as much farther away.
+            change[2] = float(row.value[0]) * float(np.mean(now.images.T_cam_board[:, 2, 3]))
+        return Selected(row._replace(log10_chance=chance), change, now)
+    else:
+        after, change = _split(now, row)
+    left = after.with_fitted_noise()
+    fall = noisy.deviance - left.deviance
     chance = log10_chance(fall, row.freedoms) + np.log10(row.explanation.n_tried)
+    if not np.isfinite(fall) or left.largest_noise > (_MOVING if row.cause in MOUNTINGS else SCATTER):
+        chance = 0.0
+    if row.cause in ("moved", "groups") and not _agree(after, row.explanation.weights > 0):
+        chance = 0.0
     return Selected(row._replace(log10_chance=min(chance, 0.0)), change, after)
 
 
-def assume(now: Hypothesis, gain: Gain) -> tuple[Hypothesis, Array]:
-    """Settle the likelihood under an explanation: what it is then, and the change of the extrinsics (6,)."""
-    explanation = gain.explanation
-    if explanation.is_of_mounting and explanation.cause != "drift":
-        assert explanation.weights is not None
-        members = explanation.weights > 0
-        n = int(now.mounting.max()) + 1
-        own = int(np.bincount(now.mounting[members]).argmax())
-        mounting = np.where(members, n, now.mounting)
-        kept, mounting = np.unique(mounting, return_inverse=True)
-        T = np.append(now.state.T_cam_lidar, perturb(now.state.T_cam_lidar[own], gain.value)[None], axis=0)[
-            kept
-        ]
-        after = now.under(mounting=mounting, T_cam_lidar=T)
-        names = kept.tolist()
-        if own not in names:
-            return after, np.zeros(6)
-        before_after = after.state.T_cam_lidar[[names.index(own), names.index(n)]]
-        return after, difference(before_after[1], before_after[0])
-    if explanation.cause in _FREED:
-        after = now.under(priors=replace(now.priors, **_FREED[explanation.cause]))
-        return after, difference(after.T_cam_lidar[0], now.T_cam_lidar[0])
-    return now, np.zeros(6)
+def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array]:
+    """Settle with a mounting of their own for some captures.
+
+    Returns:
+        The likelihood, and the change (6,) of the extrinsics from before to after, or from the rest to the
+        group.
+    """
+    members = row.explanation.weights > 0
+    own, new = int(np.bincount(now.mounting[members]).argmax()), int(now.mounting.max()) + 1
+    kept, mounting = np.unique(np.where(members, new, now.mounting), return_inverse=True)
+    T = now.state.T_cam_lidar
+    after = now.under(
+        mounting=mounting, T_cam_lidar=np.append(T, perturb(T[own], row.value)[None], axis=0)[kept]
+    )
+    if own not in kept:
+        return after, np.zeros(6)
+    T_rest, T_group = after.state.T_cam_lidar[np.searchsorted(kept, [own, new])]
+    is_first = row.cause == "moved" and members[0]
+    return after, difference(T_rest, T_group) if is_first else difference(T_group, T_rest)
+
+
+def _agree(after: Hypothesis, members: NDArray[np.bool_]) -> bool:
+    """Check whether most captures of a group fit its mounting; those with errors of their own do not."""
+    poses = Table(after, frozenset()).poses
+    singles = poses.singles(poses.gradient)
+    unit = _unit(singles[~members])
+    is_apart = [log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles[members].tolist()]
+    return 2 * sum(is_apart) < len(is_apart)
+
+
+def find_change(cost: Quadratics) -> Gain | None:
+    """Look for a change of the extrinsics during the session, from costs of F captures in these alone.
+
+    The noise of these costs is unknown and estimated from single captures, with the change removed.
+
+    Args:
+        cost: in the extrinsics' tangent, settled.
+
+    Returns:
+        The change; None if it is not significant, or if single captures or two groups explain more.
+    """
+    inverse = np.asarray(np.linalg.inv(cost.information + np.eye(6) * 1e-9), dtype=np.float64)
+    x = -inverse @ (cost.gradients.sum(axis=0) + cost.prior_gradient)
+    poses = Poses(cost.gradients + cost.hessians @ x, cost.hessians, cost.hessians, inverse)
+    if len(cost.gradients) < 2 * _FEWEST_OF_GROUP:
+        return None
+    best = min((poses.gain(each) for each in poses.candidates()), key=lambda each: each.log10_chance)
+    if best.cause != "moved":
+        return None
+    w = best.explanation.weights
+    by_z = np.tensordot(w, poses.by_z, axes=1) @ best.value
+    unit = _unit(poses.singles(poses.without(w, by_z, poses.hessian @ best.value)))
+    found = poses.gain(best.explanation, unit)
+    return found if found.log10_chance < _LEAST else None

@@ -2,50 +2,34 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 from lce_rig.core.findings import Figure, Finding, Kind, Severity, worst
 from lce_rig.core.phrasing import fill
 
 Verdict = Literal["pass", "marginal", "fail"]
-_OF_DISTANCES = (
-    "verdict.shares_differ "
-    "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "
-    "verdict.translation_uncertain verdict.scene "
-)
-_OF_POSES = _OF_DISTANCES + (
-    "verdict.cameras_differ verdict.channels_differ verdict.planes_apart verdict.sensors_disagree "
-    "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.scale "
-)
-# A chance at which sessions that agree are still said to differ more than predicted.
+# Probability below which sessions that agree are reported to differ more than predicted.
 _UNLIKELY = 0.05
-_OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
-_OF_FEW = ["verdict.sensors_disagree", "verdict.few_used", "verdict.few_placements"]
-_FOLLOWS: Mapping[str, Sequence[str]] = {
-    "association.mirrored": _OF_FEW,
-    "association.exchanged_images": _OF_FEW,
-    "verdict.exchanged": f"{_OF_POSES}verdict.intrinsics verdict.laser_angles".split(),
-    "verdict.moved": f"{_OF_POSES}verdict.laser_angles".split(),
-    "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
-    "verdict.plate_edge": [
-        "verdict.pattern_offset",
+_SYMPTOMS = frozenset(
+    (
+        "verdict.plane_residual",
         "verdict.edge_residual",
-        "verdict.shares_differ",
-        *_OF_SIGMAS,
-    ],
-    "verdict.laser_angles": _OF_POSES.split(),
-    "verdict.lens_model": f"{_OF_POSES}verdict.intrinsics verdict.pattern_offset".split(),
-    "verdict.intrinsics": (
-        f"{_OF_DISTANCES}verdict.moved verdict.scale verdict.far_from_nominal verdict.cameras_differ "
-        "verdict.planes_apart verdict.sensors_disagree verdict.few_used".split()
-    ),
-    "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
-    "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.moved verdict.planes_apart".split(),
-    "verdict.shares_differ": _OF_SIGMAS,
-    "verdict.cameras_differ": _OF_SIGMAS,
-    "verdict.channels_differ": _OF_SIGMAS,
-}
-"""What follows from a cause, the causes that explain most first."""
+        "verdict.planes_apart",
+        "verdict.sensors_disagree",
+        "verdict.channels_differ",
+        "verdict.cameras_differ",
+        "verdict.far_from_nominal",
+        "verdict.few_used",
+        "verdict.scene",
+    )
+)
+"""Symptoms, which any cause may bring about."""
+_UNCERTAIN = frozenset(("verdict.rotation_uncertain", "verdict.translation_uncertain"))
+_OF_SIZES = frozenset(("verdict.scale", "verdict.range_offset", "verdict.range_scale"))
+_PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
+_FIRST = ("association", "verdict.exchanged", "verdict.lens_model", "verdict.readout", "verdict.intrinsics")
+"""Causes that precede others of their severity, as they are detected without an estimate."""
 _LACKS = {
     ("verdict.few_placements", ""),
     ("verdict.rotation_uncertain", ""),
@@ -82,12 +66,16 @@ _CAUSES = {
     "board_bow": "the board's bow",
 }
 _CONTRADICTIONS = {
-    "intrinsics": "the profile's intrinsics and those of the session's boards",
-    "scale": "the camera's distances and the LiDAR's",
-    "pattern": "the pattern's place on the plate and the profile's",
     "channels": "the camera's channels",
-    "cameras": "the cameras",
-    "group_rest": "two groups of captures",
+    "moved": "two mountings",
+    "drifted": "the mounting at the beginning and at the end",
+    "scale": "the camera's distances and the LiDAR's",
+    "range_offset": "the LiDAR's ranges and the boards",
+    "range_scale": "the LiDAR's ranges and the boards",
+    "pattern_offset": "the pattern's place on the plate and the profile's",
+    "plate_size": "the plate's size and the profile's",
+    "laser_angles": "the lasers' angles and those of the scans",
+    "lens": "the intrinsics and the LiDAR",
 }
 
 
@@ -96,51 +84,72 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     return _VERDICTS[worst(findings)]
 
 
-def consequences(findings: Sequence[Finding]) -> dict[str, str]:
-    """Map the codes of findings that follow from others to the code of their cause.
+def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Sort findings: the cause, then other reasons, the findings that follow from the cause, and notes.
 
-    A cause that only warns, such as rough intrinsics, does not explain another that fails. Captures that are
-    before or after all others show by their order that a sensor moved: no other cause explains them.
+    The cause is the worst finding that is not a symptom. Symptoms follow from it, and the cause is as severe
+    as the worst of them. Standard deviations follow if the contradiction is their largest part, sizes of the
+    plate if ranges or squares are off.
     """
-    told = [finding for finding in findings if finding.severity != "note"]
-    codes = dict.fromkeys(finding.code for finding in told)
-    in_order = {each.code for each in told if each.code == "verdict.moved" and each.figures.get("place")}
-    fails = {finding.code for finding in findings if finding.severity == "error"}
-    causes = sorted((code for code in _FOLLOWS if code in codes), key=lambda code: code not in fails)
-    following: dict[str, str] = {}
-    for cause in causes:
-        outranked = set() if cause in fails else fails & _FOLLOWS.keys()
-        explained = (codes.keys() & _FOLLOWS[cause]) - outranked - in_order
-        following = dict.fromkeys(explained, cause) | following
-    return following
+    causes = [f for f in findings if f.severity != "note" and f.code not in _SYMPTOMS | _UNCERTAIN]
+    sizes = [f for f in findings if f.code in _OF_SIZES]
+    if sizes:
+        causes = [f for f in causes if f.code not in _PLATES]
+    order = {id(f): k for k, f in enumerate(findings)}
+
+    def rank(finding: Finding) -> tuple[bool, bool, int]:
+        is_first = finding.code in _FIRST or finding.family in _FIRST
+        return finding.severity != "error", not is_first, order[id(finding)]
+
+    cause = min(causes, key=rank, default=None)
+
+    def follows(finding: Finding) -> str:
+        if sizes and finding.code in _PLATES:
+            return sizes[0].code
+        if cause is None or finding is cause or finding.severity == "note":
+            return ""
+        is_symptom = finding.code in _SYMPTOMS or (finding.code in _UNCERTAIN and finding.action == "resolve")
+        return cause.code if is_symptom else ""
+
+    placed = [replace(f, follows=follows(f)) for f in findings if f is not cause]
+    # Sizes of the plate that follow from a note are notes.
+    is_harmless = bool(sizes) and all(f.severity == "note" for f in sizes)
+    placed = [replace(f, severity="note") if is_harmless and f.code in _PLATES else f for f in placed]
+    if cause is not None:
+        worst_of = worst([cause, *(f for f in placed if f.follows == cause.code)])
+        placed = [replace(cause, severity=worst_of, follows=""), *placed]
+    return tuple(
+        sorted(
+            placed,
+            key=lambda f: (
+                f.severity == "note",
+                bool(f.follows),
+                f.severity != "error",
+                f.code != (cause.code if cause else ""),
+            ),
+        )
+    )
+
+
+def is_symptom_alone(findings: Sequence[Finding]) -> bool:
+    """Check whether all reasons are symptoms without a cause."""
+    codes = [f.code for f in findings if f.severity != "note" and f.code not in _UNCERTAIN]
+    return bool(codes) and all(code in _SYMPTOMS for code in codes)
 
 
 def causes_of(findings: Sequence[Finding]) -> list[Finding]:
     """List the reasons of a verdict that do not follow from others."""
-    following = consequences(findings)
-    return [each for each in findings if each.severity != "note" and each.code not in following]
+    return [each for each in findings if each.severity != "note" and not each.follows]
 
 
 def lacks_captures(findings: Sequence[Finding]) -> bool:
-    """Tell whether one of the causes against a result is that captures are too few, or too much alike."""
+    """Check whether too few or too similar captures are one of the causes."""
     return any((each.code, each.action) in _LACKS for each in causes_of(findings))
 
 
 def advice_of(finding: Finding, plan: str, session: str) -> str:
-    """Give a finding's action in a session; the plan of captures where captures are what it lacks."""
+    """Return a finding's action in a session; the plan of captures if captures are missing."""
     return plan if plan and lacks_captures([finding]) else finding.advice_at(session)
-
-
-def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """List the worst causes first, then what follows from them, then notes."""
-    following, order = consequences(findings), list(_FOLLOWS)
-
-    def rank(finding: Finding) -> tuple[bool, bool, bool, int]:
-        is_note, is_error = finding.severity == "note", finding.severity == "error"
-        place = order.index(finding.code) if finding.code in order else len(order)
-        return is_note, finding.code in following, not is_error, 0 if is_note else place
-
-    return tuple(sorted(findings, key=rank))
 
 
 FAIL_FACTOR = 3.0
@@ -157,12 +166,11 @@ def cause_words(source: str) -> str:
     if source in _CAUSES:
         return _CAUSES[source]
     check = source.removeprefix("contradiction_")
-    subsets = check.replace("_", " and ")
-    return f"the contradiction of {_CONTRADICTIONS.get(check, f'{subsets} captures')}"
+    return f"the contradiction of {_CONTRADICTIONS.get(check, check.replace('_', ' '))}"
 
 
 def _correction(q: Mapping[str, Figure]) -> str:
-    """State by how much pixels move and the camera turns, where that is significant."""
+    """Render the displacement of pixels and the turn of the camera, where significant."""
     parts = [
         fill(text, q)
         for name, text in (
@@ -188,12 +196,6 @@ def _intrinsics(finding: Finding) -> str:
     else:
         reason = fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)
     return f"intrinsics {fit}: {reason}"
-
-
-def _shares_differ(finding: Finding) -> str:
-    """{first} and {second} boards differ significantly, by {rotation_deg}, {translation_m}; {others} too."""
-    text = "{first} and {second} boards differ significantly, by " + _APART
-    return fill(text + ("; {others} too" if finding.figures.get("others") else ""), finding.figures)
 
 
 def _lens_model(finding: Finding) -> str:
@@ -234,9 +236,9 @@ def _scale(finding: Finding) -> str:
     squares = fill("squares of {square_m:1mm}, not {profile_square_m:1mm}", finding.figures)
     if finding.severity == "note":
         squares = fill("squares {square_m:1mm}", finding.figures)
-        return f"boards correct the scale by {abs(scale):.1f} +- {sigma:.1f} %: {squares}, or the lens"
+        return f"boards correct the scale by {abs(scale):.1f} +- {sigma:.1f} %: {squares}, or lens or ranges"
     side = "far" if scale > 0 else "near"
-    return f"{squares}, or another lens: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
+    return f"{squares}, or lens or ranges off: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
 
 
 def _plate(finding: Finding) -> str:
@@ -258,6 +260,22 @@ def _pattern_offset(finding: Finding) -> str:
     ]
     place = "from the profile's place on the plate in {n_captures} captures (+- {sigma_m:mm})"
     return fill(f"the pattern sits {', '.join(sides)} {place}", finding.figures)
+
+
+def _range_offset(finding: Finding) -> str:
+    """The ranges of {subject} are {offset_m} +- {sigma_m} too long."""
+    side = "long" if finding.figure("offset_m") > 0 else "short"
+    sizes = {name: abs(finding.figure(name)) for name in ("offset_m", "sigma_m")}
+    return fill(f"ranges of {finding.subject} are {{offset_m:mm}} +- {{sigma_m:mm}} too {side}", sizes)
+
+
+def _range_scale(finding: Finding) -> str:
+    """The ranges of {subject} are {scale} +- {scale_sigma} too long."""
+    scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
+    side = "long" if scale > 0 else "short"
+    return (
+        f"ranges of {finding.subject} are {abs(scale):.1f} +- {sigma:.1f} % too {side}, or all of the board"
+    )
 
 
 def _moved(finding: Finding) -> str:
@@ -376,6 +394,17 @@ LENS_MODEL = Kind(
     "enter it: `lce-rig intrinsics {session} --model {other} --save-profile FILE`",
     actions={"none": "check that the images are as the camera takes them and of one lens"},
 )
+READOUT = Kind(
+    "verdict.readout",
+    "corners are sheared by {shear_px:.2f} px per 100 rows: rows exposed in turn while boards moved",
+    "hold the board still at each capture (a stand), or use a global shutter",
+    severity="warning",
+)
+TWO_BOARDS = Kind(
+    "verdict.two_boards",
+    "captures from {capture} on show squares {share:+1percent} larger than those before: two boards?",
+    "use one board in a session, and collect again",
+)
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",
     "the session determines the intrinsics better than the profile ({covered:percent} of the image covered, "
@@ -394,12 +423,6 @@ LAST_REJECTED = Kind(
     "collect two more captures",
     severity="note",
 )
-SHARES_DIFFER = Kind(
-    "verdict.shares_differ",
-    _shares_differ,
-    "cover the corners, then " + _SAVE,
-    actions={"near": "measure the squares, then `lce-rig calibrate {session} --rig FILE`"},
-)
 SCALE_OFF = Kind(
     "verdict.scale",
     _scale,
@@ -414,8 +437,59 @@ PATTERN_OFFSET = Kind(
 )
 LASER_ANGLES = Kind(
     "verdict.laser_angles",
-    "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
+    "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms",
     "check the LiDAR's model and beam table in its driver",
+)
+RANGE_OFFSET = Kind(
+    "verdict.range_offset",
+    _range_offset,
+    "enter range_offset_m: {enter_m:.3f}, then `lce-rig calibrate {session} --rig FILE`",
+)
+RANGE_SCALE = Kind(
+    "verdict.range_scale",
+    _range_scale,
+    "measure squares and plate: if they are as in the profile, ranges are off",
+)
+RANGE_CONTRAST = Kind(
+    "verdict.range_contrast",
+    "ranges on dark squares are {contrast_m:+1mm} +- {sigma_m:1mm} longer than on white ones",
+    "use a matt print of less contrast for the LiDAR",
+)
+BOW = Kind(
+    "verdict.bow",
+    "the plate is bent by {bow_m:1mm} along its {side}",
+    "lay a straight edge across the board, and enter bow_sigma_m",
+)
+LENS = Kind(
+    "verdict.lens",
+    "boards and ranges fit other intrinsics: these would move the extrinsics by " + _APART,
+    "cover the corners, then " + _SAVE,
+)
+OUTLIER = Kind(
+    "verdict.outlier",
+    "capture {capture} disagrees with the others by " + _APART,
+)
+DRIFTED = Kind(
+    "verdict.drift",
+    "the mounting drifted by " + _APART + " from the first capture to the last",
+    "fasten the sensors, let them warm up, and collect again",
+)
+FOCUS_DRIFT = Kind(
+    "verdict.focus_drift",
+    "the camera's scale drifted by {share:+1percent} from the first capture to the last",
+    "fix the focus, let the camera warm up, and collect again",
+)
+SCATTERED = Kind(
+    "verdict.scatter",
+    "board poses in images scatter {ratio:.0f} times as much as usual, cause unknown",
+    "hold the board still and check the image-scan matching",
+    severity="warning",
+)
+TIME_OFFSET = Kind(
+    "verdict.time_offset",
+    "the timestamps of {channel} are off by {offset_s:+1ms} +- {sigma_s:1ms}",
+    "enter cameras.{subject}.channels.{channel}.timestamps.expected_offset_s: {enter_s:.4f}",
+    severity="note",
 )
 EXCHANGED = Kind(
     "verdict.exchanged",

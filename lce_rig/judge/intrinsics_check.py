@@ -28,11 +28,13 @@ from lce_rig.judge.findings import (
     INTRINSICS_FIT,
     INTRINSICS_UNDETERMINED,
     LENS_MODEL,
+    READOUT,
     Verdict,
     failing,
 )
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import certainty_of, compare_lenses
+from lce_rig.lens.fit import fit_readout
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, model_of
 
@@ -51,6 +53,10 @@ _OTHER_LENS = 36.0
 # Residuals so many times the noise, in the median image, are of another lens: in 17 sound sessions, 11 of
 # them recorded, they are 0.5 to 1.1 times as large, of a fisheye lens entered as radtan 6. Twice that fails.
 _MISFIT, _FAIL = 2.0, 2.0
+# Variance of shears along the image's rows in the median image, in units of the corners' noise: in ten sound
+# recordings 0.1 to 2.0, in three of them with rows read out over 20 ms while boards move at 0.15 m/s 0.3
+# (corner noise 0.2 px), 8 and 11. Shears are printed for so many rows.
+_READOUT, _ROWS = 4.0, 100.0
 # A model that fits is at least so many times as near.
 _NEARER, _ALIKE = 2.0, 1.25
 _DEGREE, _LEAST_FREEDOMS = 3, 8
@@ -230,7 +236,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
-    """Try other lens models where corners do not fit as well as their noise allows.
+    """Try moving rows, and other lens models where corners do not fit as well as their noise allows.
 
     Args:
         fitted: intrinsics of the profile's model.
@@ -245,8 +251,10 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
     squares = np.sum(fitted.residuals_px**2, axis=1)
     rms_px = np.sqrt([part.mean() for part in np.split(squares, np.cumsum(counts)[:-1])])
     ratios = rms_px / np.maximum(noise_px, 1e-9)
-    if np.isnan(ratios).all() or np.nanmedian(ratios) < _MISFIT:
+    if np.isnan(ratios).all():
         return []
+    if np.nanmedian(ratios) < _MISFIT:
+        return _readout(fitted, noise_px)
     reached = {}
     for name, model in MODELS.items():
         with suppress(NotEnoughDataError):
@@ -257,6 +265,8 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
     near = [name for name, px in reached.items() if px < _ALIKE * least_px]
     best = min(near, key=lambda name: MODELS[name].size, default="")
     if _NEARER * least_px > fitted.rms_px:
+        if sheared := _readout(fitted, noise_px):
+            return sheared
         best = ""
     elif reached.get(own, np.inf) < _NEARER * least_px:
         return []
@@ -271,6 +281,14 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
         other_px=reached.get(best, typical_px),
     )
     return [finding]
+
+
+def _readout(fitted: IntrinsicsEstimate, noise_px: Array) -> list[Finding]:
+    """Find views (K,) whose corners of known noise are sheared along the image's rows."""
+    speed, falls = fit_readout(fitted)
+    if np.nanmedian(falls / 2 / np.maximum(noise_px, 1e-9) ** 2) < _READOUT:
+        return []
+    return [READOUT(shear_px=_ROWS * float(np.sqrt(np.mean(speed**2))))]
 
 
 def corner_noise(views: Sequence[BoardView], board: Board) -> Array:

@@ -33,17 +33,18 @@ from lce_rig.core.geometry import (
 )
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import LidarDetection
+from lce_rig.judge.explanations import find_change
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
     EXCHANGED,
     FAIL_FACTOR,
     LIDARS_DIFFER,
     LIDARS_UNNAMED,
+    MOVED,
     OTHER_MODEL,
     failing,
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
-from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig
 
@@ -262,9 +263,26 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
     if pair.from_images is None or pair.apart is None:
         return []
     seen = pair.from_images
-    halves = contrast_halves(seen.expansion, seen.centres, seen.captures)
-    cameras = " to ".join(names)
-    findings = split_findings(halves, target, cameras)
+    cameras, findings = " to ".join(names), []
+    change = find_change(seen.expansion)
+    if change is not None:
+        rotation_deg, translation_m = tangent_sizes(change.value)
+        size = target.in_targets(rotation_deg, translation_m)
+        if size > 1:
+            cut, is_own = change.explanation.cut, change.explanation.weights > 0
+            findings.append(
+                MOVED(
+                    cameras,
+                    severity=failing(size > FAIL_FACTOR),
+                    captures=tuple(name for name, own in zip(seen.captures, is_own, strict=True) if own),
+                    n_captures=int(is_own.sum()),
+                    place="first" if is_own[0] else "last",
+                    neighbour=seen.captures[cut if is_own[0] else cut - 1],
+                    rotation_deg=rotation_deg,
+                    translation_m=translation_m,
+                    chance=float(10.0**change.log10_chance),
+                )
+            )
     images_rms_m = pair.from_images.board_rms_m
     excess = target.excess(pair.apart)
     if excess > 1:

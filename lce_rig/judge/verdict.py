@@ -1,6 +1,6 @@
 """The verdict on extrinsics: each finding is a reason with its figures and an action."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion
-from lce_rig.core.findings import Finding, Refusal, Severity
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
@@ -21,48 +21,46 @@ from lce_rig.judge.findings import (
     FAR_FROM_NOMINAL,
     FEW_PLACEMENTS,
     FEW_USED,
-    INTRINSICS,
-    LASER_ANGLES,
     LAST_REJECTED,
     MAY_BE_OFF,
-    MOVED,
     NOT_CERTIFIED,
-    PATTERN_OFFSET,
     PLANE_RESIDUAL,
     PLANES_APART,
     PLATE_EDGE,
     PLATE_SIZE,
+    READOUT,
     ROTATION_UNCERTAIN,
     SCALE_OFF,
     SCENE,
     SENSORS_DISAGREE,
-    SHARES_DIFFER,
+    TIME_OFFSET,
     TRANSLATION_UNCERTAIN,
     Verdict,
-    by_cause,
+    arrange,
     failing,
+    is_symptom_alone,
     verdict_of,
 )
 from lce_rig.judge.intrinsics_check import lens_findings
-from lce_rig.judge.split_consistency import split_findings
-from lce_rig.judge.validate import MIN_PLACEMENTS, Validation
+from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
-# A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.
+# Largest standard deviation of a measured side of the plate, m, and the error that fails: 5 % exceeds the
+# beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
 # Rings do not cross the ends of a side that is as upright as this.
 _UPRIGHT = 0.87
-# Shares of scans without one of two edges, and of ring ends off the outline. Of 15 sessions with the right
-# size one lacks edges, by its mounting, and drops none; one drops as many, at hands, and lacks none.
+# Fractions of scans without one of two edges, and of ring ends off the outline, which together show a wrong
+# size. Of 15 sessions with the right size one lacks edges, by its mounting, and drops none; one drops as
+# many, at hands, and lacks none.
 _LACKING, _DROPPED = 0.3, 0.04
-# Camera and LiDAR distances differ beyond this share and so many standard deviations, and fail beyond so many
-# limits.
-_MAX_SCALE_ERROR, _SURE, _SCALE_FAIL = 0.008, 3.0, 2.5
+# Significance limit of a time offset, in standard deviations, and the offset, s, from which images may be
+# matched with other scans.
+_SURE, _LATE_S = 3.0, 0.1
 MAX_PLANE_MISFIT_M = 0.012
-"""Of both sensors' planes, rms: still boards stay below 8 mm, hand-held ones reach 20 to 30 mm."""
-# Lasers on recordings differ from their data sheet by up to 0.08 deg rms in elevation, 0.14 in azimuth.
-_MAX_DEG = 0.16
-# A contradiction of the scene by so many standard deviations fails; from three it is told.
+"""Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
+reach 20 to 30 mm."""
+# Scene contradictions: 5 standard deviations fail, 3 give a warning.
 SCENE_FAILS = 5.0
 
 
@@ -80,103 +78,72 @@ def judge(
     """Judge extrinsics by all checks.
 
     Args:
-        estimate: the extrinsic with its residuals and refusals, and the result of each channel.
+        estimate: the extrinsics with residuals and refusals, and the result of each channel.
         examination: results of the checks on its captures.
-        rig: thresholds, targets and the nominal extrinsic.
+        rig: thresholds, targets and the nominal extrinsics.
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: number of captures, including those without a board.
-        others: of other evidence: contradictions between cameras.
-        T_view: (4, 4) from the frame of the nominal extrinsic to that of the estimate; None for the same.
-        n_misfits: images whose corners fit no pose of the board. A wrong lens causes them.
+        others: findings of other evidence: contradictions between cameras.
+        T_view: (4, 4) from the frame of the nominal extrinsics to that of the estimate; None for the same.
+        n_misfits: images whose corners fit no pose of the board, as with a wrong lens.
 
     Returns:
-        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
+        The verdict, and its findings: the cause first, then what follows from it, then notes.
     """
-    board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
-    proof, n_placements = estimate.certificate, estimate.diagnostics.n_placements
-    are_angles_known = rig.lidars[lidar].has_rings and n_placements >= MIN_PLACEMENTS
+    board, nominal, proof = rig.board.to_board(), rig.nominal(camera, lidar), estimate.certificate
     findings = [
         *([] if proof.is_optimal else [NOT_CERTIFIED(gap=proof.gap)]),
-        *examination.lens_model,
-        *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
-        *(angle_findings(estimate.laser_angles) if are_angles_known else ()),
-        *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
-        *_scale(examination.scale, board),
-        *_pattern(examination.pattern, len(estimate.used)),
-        *split_findings(examination.contrasts, rig.calibration),
         *others,
+        *_lens(examination, rig, is_misfit=2 * n_misfits >= len(estimate.used)),
+        *examination.causes,
+        *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_motion(estimate),
         *_channels(estimate, rig),
+        *_times(estimate, rig, camera),
         *residuals_beyond(estimate.metrics, rig.quality),
         *_captures(estimate, n_captures, rig.quality),
         *_nominal(estimate.T_cam_lidar if T_view is None else invert(T_view) @ estimate.T_cam_lidar, nominal),
         *_precision(estimate, examination, rig),
     ]
-    is_weighed = estimate.method == "ml" and estimate.lens is not None
-    is_misfit = 2 * n_misfits >= len(estimate.used)
-    return _verdict(_blame_lens(_weigh_scale(findings, is_weighed), is_misfit), examination.cov)
+    return _verdict(_once(_explained(findings, examination)), examination.cov)
 
 
-def _blame_lens(findings: Sequence[Finding], is_misfit: bool) -> list[Finding]:
-    """Make contradicted intrinsics the cause of boards at two places that differ, unless squares are it.
-
-    Captures that fit another mounting are a note beside intrinsics that fit few images, but not those whose
-    images show that cameras moved against each other.
-
-    Args:
-        findings: against extrinsics.
-        is_misfit: whether corners fit no pose of the board in many images.
-    """
-    blamed = [f for f in findings if f.code == INTRINSICS.code and (is_misfit or f.severity == "warning")]
-    if not blamed:
+def _explained(findings: Sequence[Finding], examination: Validation) -> list[Finding]:
+    """Make the first cause a reason if it explains the captures and there are only symptoms besides."""
+    if not (examination.is_explained and is_symptom_alone(findings)):
         return list(findings)
-    errors = {f.code for f in findings if f.severity == "error"}
-    moved = [f for f in findings if is_misfit and f.code == MOVED.code and not f.subject]
-    is_cause = any(f.severity == "error" for f in moved) or (
-        SHARES_DIFFER.code in errors and SCALE_OFF.code not in errors
-    )
-
-    def severity_of(f: Finding) -> Severity:
-        if f in blamed and is_cause:
-            return "error"
-        return "note" if f in moved else f.severity
-
-    return [replace(f, severity=severity_of(f)) for f in findings]
+    return [replace(f, severity="warning") if f is examination.causes[0] else f for f in findings]
 
 
-def _weigh_scale(findings: Sequence[Finding], is_weighed: bool) -> list[Finding]:
-    """Make squares of another size the cause where planes or captures contradict, a note where none does.
+def _lens(examination: Validation, rig: Rig, is_misfit: bool) -> list[Finding]:
+    """Find intrinsics of the profile that do not fit; an error where corners fit no pose in many images.
 
-    Captures that fit another mounting, though not before or after the others, are a note beside it.
-
-    Args:
-        findings: against extrinsics.
-        is_weighed: whether the method estimates the squares.
+    Corners that a wrong lens displaces look sheared, too.
     """
-    if all(f.code != SCALE_OFF.code for f in findings):
-        return list(findings)
-    scattered = [f for f in findings if f.code == MOVED.code and not f.figures["place"]]
-    is_blamed = bool(scattered) or any(f.code == PLANE_RESIDUAL.code for f in findings)
-    # Squares that fail by their size alone are seen in planes first.
-    is_seen = any(f.code in (PLANES_APART.code, SHARES_DIFFER.code) for f in findings)
+    found = lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg)
+    is_wrong = any(f.severity != "note" for f in found)
+    of_model = [f for f in examination.lens_model if not (is_wrong and f.code == READOUT.code)]
+    return [
+        *of_model,
+        *(replace(f, severity="error") if is_misfit and f.severity == "warning" else f for f in found),
+    ]
 
-    def severity_of(f: Finding) -> Severity:
-        if f.code == SCALE_OFF.code:
-            is_note = is_weighed and not (is_seen and f.severity == "error")
-            return "error" if is_blamed else "note" if is_note else f.severity
-        return "note" if f in scattered else f.severity
 
-    return [replace(f, severity=severity_of(f)) for f in findings]
+def _once(findings: Sequence[Finding]) -> list[Finding]:
+    """Drop notes on the plate's size if the scans' outlines give a reason."""
+    is_named = any(f.code == PLATE_SIZE.code and f.severity != "note" for f in findings)
+    return [f for f in findings if not (is_named and f.code == PLATE_SIZE.code and f.severity == "note")]
 
 
 def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Finding, ...]]:
-    """Draw the verdict; where it is marginal, a note says how wrong the extrinsics may be."""
-    verdict, others = verdict_of(findings), [f for f in findings if f.code != "verdict.may_be_off"]
+    """Return verdict and sorted findings; MARGINAL has a note with the 95 % error bound."""
+    others = arrange([f for f in findings if f.code != MAY_BE_OFF.code])
+    verdict = verdict_of(others)
     if verdict != "marginal":
-        return verdict, by_cause(others)
+        return verdict, others
     rotation_deg, translation_m = largest_sizes(cov)
-    return verdict, by_cause([MAY_BE_OFF(rotation_deg=rotation_deg, translation_m=translation_m), *others])
+    return verdict, (*others, MAY_BE_OFF(rotation_deg=rotation_deg, translation_m=translation_m))
 
 
 def with_findings(calibration: Calibration, found: Sequence[Finding]) -> Calibration:
@@ -201,7 +168,7 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
     Args:
         opinion: of the scene.
         calibration: the extrinsics.
-        action: where it is known already.
+        action: if known already.
     """
     worst = opinion.strongest
     if worst is None:
@@ -232,8 +199,8 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
         sigma, worst = float(np.linalg.norm(axes)), int(np.argmax(axes))
         if sigma <= goal:
             continue
-        # No number of captures helps against the LiDAR's own errors; before that, more captures help most as
-        # long as their scatter is the larger part.
+        # More captures do not reduce the LiDAR's own errors; otherwise they help as long as their scatter is
+        # the larger part.
         is_of_lidar = of_lidar_alone > goal and 2 * of_lidar_alone**2 > sigma**2
         figures: dict[str, Any] = {
             f"sigma_{unit}": sigma,
@@ -242,7 +209,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
             "weakest": MOTIONS[first + worst],
         }
         yield kind(
-            # A contradiction is judged by the check that found it; here it says how wrong the result may be.
+            # Without contradictions: the check that found one decides about it.
             severity=failing(agreed > FAIL_FACTOR * goal),
             action="measure_ranges"
             if is_of_lidar
@@ -263,40 +230,6 @@ def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]
     ]
 
 
-def _scale(scale: tuple[float, float] | None, board: Board) -> list[Finding]:
-    """Compare the camera's distances with the LiDAR's."""
-    if scale is None or abs(scale[0]) <= max(_MAX_SCALE_ERROR, _SURE * scale[1]):
-        return []
-    is_fail = abs(scale[0]) - _SURE * scale[1] > _SCALE_FAIL * _MAX_SCALE_ERROR
-    return [
-        SCALE_OFF(
-            severity=failing(is_fail),
-            scale=scale[0],
-            scale_sigma=scale[1],
-            square_m=board.square_m / (1 + scale[0]),
-            profile_square_m=board.square_m,
-        )
-    ]
-
-
-def angle_findings(sizes: Mapping[str, float]) -> list[Finding]:
-    """Find lasers whose angles are not those of the scans."""
-    return [
-        LASER_ANGLES(angle=name, rms_deg=rms_deg, limit_deg=_MAX_DEG)
-        for name, rms_deg in sizes.items()
-        if rms_deg > _MAX_DEG
-    ]
-
-
-def _pattern(pattern: tuple[Array, Array] | None, n_captures: int) -> list[Finding]:
-    """Find a pattern that sits elsewhere on the plate than the profile states."""
-    if pattern is None:
-        return []
-    (right_m, up_m), cov = pattern[0].tolist(), pattern[1]
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
-    return [PATTERN_OFFSET(right_m=right_m, up_m=up_m, sigma_m=sigma_m, n_captures=n_captures)]
-
-
 def _motion(estimate: CalibrationEstimate) -> list[Finding]:
     rms_m = estimate.diagnostics.fit_plane_rms_m
     if not rms_m > MAX_PLANE_MISFIT_M:  # NaN where the method has no such residual
@@ -305,8 +238,26 @@ def _motion(estimate: CalibrationEstimate) -> list[Finding]:
     return [PLANES_APART(action="compensated" if is_compensated else "", rms_m=rms_m)]
 
 
+def _times(estimate: CalibrationEstimate, rig: Rig, camera: str) -> Iterator[Finding]:
+    """List time offsets of channels that differ significantly from the profile's."""
+    for each in estimate.channels:
+        if each.time_offset_s is None or each.time_offset_sigma_s is None:
+            continue
+        if abs(each.time_offset_s) <= _SURE * each.time_offset_sigma_s:
+            continue
+        expected_s = rig.cameras[camera].channels[each.channel].timestamps.expected_offset_s
+        yield TIME_OFFSET(
+            camera,
+            severity="warning" if abs(each.time_offset_s) > _LATE_S else "note",
+            channel=each.channel,
+            offset_s=each.time_offset_s,
+            sigma_s=each.time_offset_sigma_s,
+            enter_s=expected_s + each.time_offset_s,
+        )
+
+
 def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
-    """Compare the channels of one camera, which has one pose."""
+    """Compare the channels of one camera, which share its pose."""
     apart = estimate.channel_difference
     if apart is None or (excess := rig.calibration.excess(apart)) <= 1:
         return []
@@ -368,8 +319,8 @@ def _nominal(T: Array, nominal: NominalExtrinsic | None) -> list[Finding]:
 def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[Finding]:
     """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot.
 
-    On a plate that is too large in the profile by more than the search for its edges reaches, one of two
-    opposite edges stays without ring ends, and those of the true edge are dropped.
+    If the profile's plate is larger than the true one by more than the search range for edges, one of two
+    opposite edges has no ring ends, and those of the true edge are dropped.
 
     Args:
         scans: boards, and refusals: a plate refused for its size counts as measured.
@@ -418,7 +369,7 @@ def distance_findings(
 ) -> list[Finding]:
     """Compare distances between boards, which are the same for both sensors with any extrinsics.
 
-    Coarse, and before any estimate: it names squares or a lens so wrong that captures are refused.
+    A coarse check before any estimate: it finds squares or a lens so wrong that captures are refused.
 
     Args:
         in_camera, in_lidar: (N, 3) centres of the boards of N captures, m.

@@ -291,6 +291,31 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
     return np.asarray(np.moveaxis(-np.linalg.solve(Jt @ J, Jt @ (G @ errors.T)), -1, 0))
 
 
+def fit_readout(estimate: IntrinsicsEstimate) -> tuple[Array, Array]:
+    """Fit to each view of an estimate that its rows were read out one after another while the board moved.
+
+    Corners are displaced by the board's motion since the middle row, in proportion to their row. Most of that
+    a pose takes up; the rest shears the board, as no pose does.
+
+    Returns:
+        (K, 2) displacement in x and y per row, and (K,) fall of the sum of squared residuals, px^2.
+    """
+    corners_px = np.array([view.board.corners_px for view in estimate.views])
+    setup, state = _of_estimate(estimate, corners_px, estimate.T_cam_board)
+    residuals, _, J = linearise(setup, state)
+    is_seen = np.isfinite(corners_px)
+    rows = np.where(is_seen[..., 1], corners_px[..., 1], 0.0)
+    rows = rows - is_seen[..., 1] * (rows.sum(axis=1) / is_seen[..., 1].sum(axis=1))[:, None]
+    shears = rows[:, :, None, None] * np.eye(2)
+    shears = shears.reshape(len(rows), -1, 2)
+    Jt = np.swapaxes(J, 1, 2)
+    shears = shears - J @ np.linalg.solve(Jt @ J, Jt @ shears)
+    St = np.swapaxes(shears, 1, 2)
+    H, g = St @ shears, St @ residuals[..., None]
+    speed = np.linalg.solve(H, g)
+    return np.asarray(speed[..., 0]), np.asarray(np.sum(g * speed, axis=(1, 2)))
+
+
 def _of_estimate(
     estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Array
 ) -> tuple[Setup, LensState]:

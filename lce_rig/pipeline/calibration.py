@@ -298,7 +298,7 @@ def _examine(
         rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
         if estimate.lens is not None and rejected:
             rejected = estimate.lens.refit(rejected)
-    return validate(estimate, rig, rig.lidars[first.lidar], lens, rejected)
+    return validate(estimate, rig, first.camera, first.lidar, lens, rejected)
 
 
 def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> list[_Link]:

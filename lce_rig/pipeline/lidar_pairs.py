@@ -121,7 +121,7 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
     )
     estimate, rejected, T_view = estimate_between_lidars(candidates, boards, board, settings)
     rejected = [match_candidates(o, board, estimate.T_cam_lidar) for o in rejected]
-    validation = validate(estimate, rig, rig.lidars[second], None, rejected)
+    validation = validate(estimate, rig, first, second, None, rejected)
     scans = detections.lidars
     n_captures = len(candidates) + len(lacking)
     T = invert(T_view) @ estimate.T_cam_lidar

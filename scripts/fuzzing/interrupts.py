@@ -20,7 +20,7 @@ from fuzzing.report import Report
 
 WITHIN_S = 2.0
 # Without its devices a rig is not fit to collect.
-_DONE = {"doctor": 5, "repeat": 7}
+_DONE = {"doctor": 5, "repeat": 4}
 _PATIENCE_S = 30.0
 _LONGEST_S = 30.0
 _SAID = "interrupted; what was written so far is whole"

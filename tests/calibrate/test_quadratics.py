@@ -47,7 +47,6 @@ def test_moves_are_those_of_estimates_made_anew_without_each_group():
     hessians = np.swapaxes(A, 1, 2) @ A
     cost = without_prior(gradients, hessians, group)
     moves = cost.moves()
-    np.testing.assert_allclose(moves, cost.without_each(), atol=1e-12)
     anew = np.array([fit(group != k) for k in range(4)])
     np.testing.assert_allclose(estimate + moves, anew, atol=1e-12)
     expected = 3 / 4 * (anew - estimate).T @ (anew - estimate)

@@ -23,7 +23,7 @@ def validated(lens=CAMERA, board=BOARD, seed=1):
     estimate = fit_extrinsic(captures, board, settings)
     of_board = RIG.board.model_copy(update={"square_m": board.square_m})
     rig = RIG.model_copy(update={"board": of_board})
-    return estimate, validate(estimate, rig, RIG.lidars["lidar"], lens)
+    return estimate, validate(estimate, rig, "cam", "lidar", lens)
 
 
 @pytest.fixture(scope="module")

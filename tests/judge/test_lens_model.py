@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from lce_rig.judge.intrinsics_check import corner_noise, model_findings
@@ -34,3 +35,17 @@ def test_the_noise_of_corners_is_measured_without_a_lens_on_a_bent_board():
     views = photograph(10, 4, Scene(bow_m=(0.004, 0.002)))
     # Two coordinates of 0.05 px each.
     assert corner_noise(views, BOARD).mean() == pytest.approx(0.07, rel=0.2)
+
+
+def test_model_findings_rows_in_turn_are_named():
+    """Boards move by a pixel in 100 rows while a rolling shutter reads the image."""
+    rng = np.random.default_rng(0)
+    views = []
+    for view in photograph(12, 4, replace(NEAR, distance_m=(1.5, 3.0), sigma_px=0.02)):
+        corners_px = view.board.corners_px.copy()
+        direction = rng.standard_normal(2)
+        speed = 0.01 * direction / np.linalg.norm(direction)
+        corners_px += speed * (corners_px[:, 1:] - corners_px[:, 1:].mean())
+        views.append(replace(view, board=replace(view.board, corners_px=corners_px)))
+    fitted = estimate_intrinsics(views, BOARD, NEAR.lens, MODELS["radtan4"], n_folds=0)
+    assert [finding.code for finding in model_findings(fitted, BOARD)] == ["verdict.readout"]

@@ -24,24 +24,26 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import LidarBoard, Observation
 
-# Steps between changes of the levels, and their maximum at the end.
+# Maximum number of steps between fits of the levels, and of the last steps.
 _STEPS, _LAST_STEPS = 3, 20
-# Steps end where the next one is shorter than this, in standard deviations of all unknowns together.
+# Length of the next step that ends them, in standard deviations of all unknowns together.
 _NEAR, _SETTLED = 0.1, 5e-3
 # Rounds of the search for noise levels, each followed by a new linearisation.
 _LEVEL_ROUNDS = (8, 4, 8)
-# First blurs of ring ends: as long as the edge shift is unknown, all of them may lie outside
-# their intervals, where a sharp density is flat.
+# First blurs of ring ends, rad: until the edge shift is known, all of them may lie outside their intervals,
+# where a sharp density is flat.
 _BLURS_RAD = (4e-3, 1.5e-3)
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
-# Moves beyond so many of their standard deviations count less than in full (Huber; 95 % efficient).
+# Huber's constant, in standard deviations of a placement's influence (95 % efficient), and an upper bound.
 _HUBER, _FARTHEST = 1.5, 1e6
-# Plain steps before any are mixed, and how many are.
+# Number of plain steps before Anderson mixing, and of steps that it combines.
 _PLAIN, _MIXED = 3, 5
 # Errors of lens and board that `Priors.held` holds.
 _HELD = ("pattern_offset", "intrinsics")
-# A mixed step is at most so many times as long as the plain one.
+# Squared length of a step that counts as diverged, in standard deviations.
+_DIVERGED = 1e12
+# Largest ratio of a mixed step's length to the plain one's.
 _LONGEST = 5.0
 
 
@@ -80,10 +82,10 @@ class JointEstimate:
 
     @cached_property
     def covariances(self) -> tuple[Array, Array]:
-        """Parts (G, G) of the covariance of z: what differs between sessions, and errors of the LiDAR.
+        """Parts (G, G) of the covariance of z: noise of the session, and errors of the LiDAR.
 
         With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + sum_i H^-1 P_i H^-1, with the
-        priors P_i of each kind of constant error. Those of lens and board are in `moves`.
+        priors P_i of each kind of constant error. `moves` holds those of lens and board.
         """
         inverse, prior = self.cost.covariance(), self.cost.prior.copy()
         for at, _ in self._profiled.values():
@@ -109,7 +111,7 @@ class JointEstimate:
 
     @property
     def _profiled(self) -> dict[str, tuple[Indices, float]]:
-        """By error of lens and board, its places in z and its standard deviation."""
+        """Places in z and standard deviation of each error of lens and board, by name."""
         layout, priors = self.state.layout, self.priors
         found = {
             "plate_size": (layout.plate, priors.plate_m),
@@ -158,7 +160,7 @@ def maximise_likelihood(
     pose_ratios: Sequence[Mapping[str, float]] | None = None,
     lenses: Sequence[SessionLens | None] | None = None,
 ) -> JointEstimate:
-    """Estimate extrinsics of C cameras; captures of the same name share their scan and the board's pose.
+    """Estimate extrinsics of C cameras; captures with the same name share scan and board pose.
 
     Args:
         cameras: observations of each.
@@ -167,7 +169,7 @@ def maximise_likelihood(
         priors: of the constant errors.
         usual: typical noise levels.
         pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
-        lenses: of each camera, whose errors are unknowns; None for lenses that are exact.
+        lenses: of each camera, with errors as unknowns; None for exact lenses.
     """
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
     by_name = {
@@ -227,12 +229,11 @@ def _maximise(
 ) -> JointEstimate:
     """Alternate between steps towards the optimum and fits of the noise levels.
 
-    Captures, whose placements (F,) are given, are weighed by how they disagree on the extrinsics.
+    Captures are weighted by their disagreement on the extrinsics, each of the placements (F,) as one.
     """
     held = priors.held
     now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
-    for blur_rad in _BLURS_RAD:
-        terms = settle(terms, now.blurred(blur_rad), held, _STEPS, _NEAR)
+    terms = approach(terms, now, held)
     for n_rounds in _LEVEL_ROUNDS:
         terms = settle(terms, now, held, _STEPS, _NEAR)
         now = fit_levels(terms, now, usual, held, n_rounds)
@@ -241,12 +242,19 @@ def _maximise(
     return JointEstimate(settle(terms, now, held, _LAST_STEPS, _SETTLED), now, priors, placement, captures)
 
 
-def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
-    """Find the optimum at given levels in at most so many steps, until the next one is short.
+def approach(terms: Terms, levels: Levels, priors: Priors) -> Terms:
+    """Approach the optimum from a distant start, with blurred ring ends."""
+    for blur_rad in _BLURS_RAD:
+        terms = settle(terms, levels.blurred(blur_rad), priors, _STEPS, _NEAR)
+    return terms
 
-    The mean information of ring ends is not the curvature of their cost: plain steps are a fifth of what
-    they should be in some directions, and leap back and forth in others. Steps are therefore corrected by how
-    earlier ones turned out (Anderson mixing). From steps s_k and moves m_k,
+
+def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
+    """Find the optimum at given levels in at most `n_steps` steps, until the next one is short.
+
+    The mean information of ring ends is not the curvature of their cost: plain steps are five times too short
+    in some directions and oscillate in others. Anderson mixing corrects them by the effect of earlier steps.
+    From steps s_k and moves m_k,
 
         m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
 
@@ -257,7 +265,8 @@ def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: fl
     moves: list[Array] = []
     for _ in range(n_steps):
         reduced = assemble(terms, levels, priors)
-        if reduced.decrement < short**2:
+        # Far from any optimum steps may diverge: keep the last finite terms.
+        if not short**2 <= reduced.decrement < _DIVERGED:
             break
         z, y = reduced.step
         move = step = np.append(z, y)
@@ -321,14 +330,14 @@ def fit_levels(
 
 
 def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
-    """Count, roughly, the measurements that tell of each level: n tell its logarithm to 1 / (2 n)^1/2."""
+    """Estimate the number n of measurements that determine each level: its logarithm to 1 / (2 n)^1/2."""
     n_returns = terms.ranges.n_returns
     n_ends, n_backed = len(terms.edges.rows), np.count_nonzero(terms.edges.is_backed)
     n_images = sum(len(images.capture) for images in terms.images)
     return {
         "range_m": float(n_returns.sum()),
         "ring_m": float(np.count_nonzero(n_returns)),
-        # Only ring ends near the ends of their intervals show how blurred these are.
+        # Only ring ends near the ends of their intervals show the blur.
         "edge_rad": 0.3 * (n_ends - n_backed),
         "backed_rad": 0.3 * n_backed,
         "lost_share": 0.5 * levels.lost_share * n_ends,
@@ -342,7 +351,7 @@ def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
 
 
 def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
-    """Weigh captures (F,) by how far the extrinsics move without them, compared with what noise explains.
+    """Weight captures (F,) by the shift of the extrinsics without them, relative to that expected from noise.
 
     Without placement k the unknowns move by m_k = (H - H_k)^-1 g_k, with the covariance (H - H_k)^-1 - H^-1.
     With C the covariance of the extrinsics and J their derivative,
@@ -352,7 +361,8 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     shared by the captures of the placement.
 
     Pose errors of recorded images have longer tails than normal ones: on two recordings, one capture of 18
-    and one of 27 moved the result by three and five times what noise explains, the next one by less than two.
+    and one of 27 moved the result three and five times as far as expected from noise, the next one less than
+    twice.
 
     References:
         Huber, "Robust Statistics", 1981.
@@ -372,9 +382,9 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
 
 
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
-    """Weigh captures (F,) so that those of one placement, whose errors are the same, count as one.
+    """Weight captures (F,) so that those of one placement, with the same errors, count as one.
 
-    Where cameras saw a placement in different numbers of captures, those that few of them saw count more.
+    Of a placement that cameras saw in different numbers of captures, the smallest number counts.
     """
     fewest = np.full(len(placement), np.inf)
     for camera in images:

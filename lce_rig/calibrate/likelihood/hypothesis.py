@@ -1,8 +1,8 @@
 """The likelihood of one camera's captures under assumptions other than those of its estimate.
 
-It serves to judge an estimate. Every capture has full weight, and the images' errors begin at their usual
-levels: captures that contradict each other would lose weight, and widen the noise that judges them. No
-unknown is held, and priors have no tails.
+It serves to judge an estimate. Every placement has full weight, and the images' errors begin at their usual
+levels. In the estimate, captures that contradict each other lose weight and raise the noise by which they are
+judged. No unknown is held, and priors have no tails.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.fit import (
     JointEstimate,
+    approach,
     extrinsics_by_unknowns,
     fit_levels,
     settle,
@@ -29,9 +30,9 @@ from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.geometry import Array, exp_so3, invert, perturb, pose, rotation_angle
 from lce_rig.core.results import Observation
 
-# Steps of captures' own poses under given extrinsics, and of all unknowns; these end below so many standard
-# deviations.
-_OWN_STEPS, _STEPS, _SHORT = 4, 60, 0.3
+# Number of steps of captures' own poses under given extrinsics, maximum number of steps of all unknowns, and
+# the length that ends these, in standard deviations.
+_OWN_STEPS, _STEPS, _SHORT = 4, 80, 0.5
 _LEVEL_ROUNDS = 8
 _TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((4, 3)))
 
@@ -46,9 +47,9 @@ class Hypothesis:
         levels: of the noise.
         priors: of the constants.
         captures: (F,) names, sorted.
-        mounting: (F,) number of the mounting that each capture shows.
-        T_lidar_board: (F, 4, 4) of the boards as the scans alone show them, or as the estimate has them.
-        is_further: (F,) whether the captures are not of the estimate.
+        mounting: (F,) number of each capture's mounting.
+        T_lidar_board: (F, 4, 4) poses of the boards by the estimate, or by the scan alone if it has none.
+        is_further: (F,) True for captures that the estimate does not use.
     """
 
     terms: Terms
@@ -71,9 +72,11 @@ class Hypothesis:
         return assemble(self.terms, self.levels, self.priors)
 
     @property
-    def T_cam_lidar(self) -> Array:
-        """(M, 4, 4) extrinsics of each mounting, as they are used with the camera's intrinsics."""
-        return perturb(self.state.T_cam_lidar, extrinsics_by_unknowns(self.terms) @ self.state.z)
+    def T_in_use(self) -> Array:
+        """(4, 4) extrinsics of the mounting with the most captures, as used with the camera's intrinsics."""
+        most = int(np.bincount(self.mounting).argmax())
+        moves = extrinsics_by_unknowns(self.terms) @ self.state.z
+        return perturb(self.state.T_cam_lidar[most], moves[most])
 
     @cached_property
     def deviance(self) -> float:
@@ -85,18 +88,22 @@ class Hypothesis:
         """Return a level of the images' errors in units of the usual one."""
         return float(getattr(self.levels, name) / getattr(Levels(), name))
 
+    @property
+    def largest_noise(self) -> float:
+        """The largest `noise_ratio` of the images' levels."""
+        return max(self.noise_ratio(name) for name in OF_IMAGES)
+
     def with_fitted_noise(self) -> "Hypothesis":
-        """Fit the levels of the images' errors."""
+        """Fit the levels of the images' errors at the present expansion point."""
         usual = replace(self.levels, **{name: getattr(Levels(), name) for name in OF_IMAGES})
         fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
-        return self.under(levels=fitted)
+        return replace(self, levels=fitted)
 
     def under(
         self,
         priors: Priors | None = None,
         mounting: NDArray[np.intp] | None = None,
         T_cam_lidar: Array | None = None,
-        levels: Levels | None = None,
     ) -> "Hypothesis":
         """Settle under other assumptions.
 
@@ -104,10 +111,8 @@ class Hypothesis:
             priors: of the constants; the present ones by default.
             mounting: (F,) of the captures; the present one by default.
             T_cam_lidar: (M, 4, 4) of each mounting, to start from.
-            levels: of the noise; the present ones by default.
         """
-        priors, levels = priors or self.priors, levels or self.levels
-        old, terms = self.state, self.terms
+        old, terms, priors = self.state, self.terms, priors or self.priors
         if mounting is None or T_cam_lidar is None:
             mounting = self.mounting
         else:
@@ -117,13 +122,14 @@ class Hypothesis:
             layout = Layout([n_optics], old.layout.n_rings, [0] * len(split))
             z = old.common_to(layout, terms.scans.rings, terms.scans.rings)
             z[layout.optics(0)] = old.z[old.layout.optics(0)]
-            # A wrong mounting has drawn boards away from where their scans show them.
+            # A wrong mounting has displaced boards from their positions in the scans.
             is_new = ((mounting != self.mounting) & self.is_further)[:, None, None]
             T_lidar_board = np.where(is_new, self.T_lidar_board, old.T_lidar_board)
             state = State(layout, T_cam_lidar, T_lidar_board, old.own_shift_m, z)
             terms = linearise(terms.scans, split, terms.board, state, terms.trust)
-        terms = settle(terms, levels, priors, _STEPS, _SHORT)
-        return replace(self, terms=terms, levels=levels, priors=priors, mounting=mounting)
+            terms = approach(terms, self.levels, priors)
+        terms = settle(terms, self.levels, priors, _STEPS, _SHORT)
+        return replace(self, terms=terms, priors=priors, mounting=mounting)
 
 
 def at_full_weight(
@@ -133,8 +139,8 @@ def at_full_weight(
 
     Args:
         joint: the estimate.
-        observations: of the camera, which may be more than those that the estimate is of.
-        lens: of the camera; None where it is exact.
+        observations: of the camera, also of captures that the estimate does not use.
+        lens: of the camera; None if it is exact.
         camera: its number.
     """
     board, T_cam_lidar = joint.terms.board, joint.state.T_cam_lidar[camera]
@@ -160,7 +166,7 @@ def at_full_weight(
 
 
 def _nearest_turn(observation: Observation, T_cam_lidar: Array) -> Array:
-    """Choose of the plate's four turns the one in which the scan's pose is nearest to the image's."""
+    """Rotate the scan's pose about the plate's normal by the multiple of 90 deg nearest to the image's."""
     expected = invert(T_cam_lidar) @ observation.image.T_cam_board
     turned = observation.lidar.T_lidar_board @ _TURNS
     return np.asarray(turned[int(np.argmin(rotation_angle(turned[:, :3, :3], expected[:3, :3])))])

@@ -1,7 +1,7 @@
 """Layout of the unknowns: the name of each, and its place in every vector, matrix and row of the likelihood.
 
-The unknowns of each capture are y = [pose, own_shift]: the tangent of T_lidar_board, and what the capture
-adds to the shift of ring ends. All captures share
+The unknowns of each capture are y = [pose, own_shift]: the tangent of T_lidar_board, and the capture's own
+shift of ring ends. All captures share
 
     z = [camera 0, ..., range, azimuth, elevation, lens, bow, stretch, contrast, shifts, squares, pattern,
          optics 0, ...]
@@ -88,7 +88,7 @@ class Layout:
     Args:
         n_optics: number of unknowns of each lens.
         n_rings: L.
-        lens_of: of which lens each camera's images are; of its own by default. A camera that moved is two.
+        lens_of: number of the lens of each camera, its own by default. A camera that moved counts as two.
 
     Attributes:
         z: places in the vector of the unknowns that captures share.
@@ -116,7 +116,7 @@ class Layout:
         return np.array([self.camera(c) for c in range(self.n_cameras)], dtype=np.intp).reshape(-1, 6)
 
     def errors(self, c: int) -> Indices:
-        """Places in z of what moves the poses in a camera's images: print and lens."""
+        """Places in z of the errors that move the poses in a camera's images: print and lens."""
         return self.z.of([*BOARD, f"optics {self._lens_of[c]}"])
 
     def optics(self, c: int) -> Indices:

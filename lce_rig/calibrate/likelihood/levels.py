@@ -23,10 +23,10 @@ class Levels:
         edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`rays`).
         backed_rad: the same with an object close behind.
         lost_share: fraction of ring ends whose last returns are missing.
-        own_shift_m: what each capture adds to the edge shift of all.
-        tilt_rad, spin_rad: errors of a board's turn in an image beyond corner noise.
-        depth_m, across_m: errors of its place, along and across the line of sight.
-        laser_m: of the lasers' range offsets about their mean.
+        own_shift_m: each capture's own part of the edge shift.
+        tilt_rad, spin_rad: errors of a board's rotation in an image beyond corner noise.
+        depth_m, across_m: errors of its position, along and across the line of sight.
+        laser_m: the lasers' range offsets about their mean.
     """
 
     range_m: float = 0.008
@@ -67,7 +67,7 @@ OF_IMAGES = ("tilt_rad", "spin_rad", "depth_m", "across_m")
 """The levels of a board's pose in an image."""
 
 
-# Deviations of what is exact, m and relative.
+# Standard deviations of exact constants, m and relative.
 _EXACT_M, _EXACT = 1e-6, 1e-6
 
 
@@ -75,9 +75,9 @@ _EXACT_M, _EXACT = 1e-6, 1e-6
 class Priors:
     """Standard deviations a priori of the constant errors, which are the same in every capture.
 
-    An estimate holds the pattern's place and the lenses: small errors of the model would move them. With both
-    free, the results of two recorded sessions of one rig (rlfs01, rlfs02) differ by 7.1 mm at the boards,
-    held by 4.1 mm. Their errors are part of the covariance.
+    An estimate holds the pattern's place and the lenses, which small errors of the model would move. With
+    both free, the results of two recorded sessions of one rig (rlfs01, rlfs02) differ by 7.1 mm at the
+    boards, held by 4.1 mm. The covariance contains their errors.
 
     Attributes:
         offset_m: range offset common to all lasers.
@@ -89,16 +89,16 @@ class Priors:
         lateral_m: lens beside the LiDAR's axis, `rays`.
         vertical_m: its height, per rad of elevation.
         bow_m: height of the plate's middle over its ends, along its width and its height.
-        azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
+        azimuth_rad, elevation_rad: angles of each laser about their means, which are part of the extrinsics.
         stretch: relative error of ranges; held.
         contrast_m: difference of ranges between dark and white parts of the print; held.
         beam: relative error of the beam's width and of its height, without rings.
-        known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
+        known: the LiDAR's errors as measured before: means and standard deviations of lasers and lens.
         squares: relative error of the squares' size.
         pattern_m: error of the pattern's place on the plate, to the right and up; held.
         optics: errors of each lens, in directions of unit variance; held.
-        freedoms: of Student's distribution of errors of squares, pattern and plate, as a profile may be wrong
-            by far; infinite for a normal one.
+        freedoms: degrees of freedom of Student's distribution of errors of squares, pattern and plate, as a
+            profile may be wrong by far; infinite for a normal distribution.
     """
 
     offset_m: float = 0.005
@@ -123,7 +123,7 @@ class Priors:
 
     @property
     def of_scans(self) -> dict[str, Array]:
-        """Deviations of the displacements of points and of shifts (11,), as `layout` names them."""
+        """Standard deviations of the displacements of points and shifts (11,), by the names of `layout`."""
         of_width = [self.shift_m, self.growth, *self.background_m, self.plate_m, self.plate_m]
         return {
             "lens": np.array([self.lateral_m, self.vertical_m]),
@@ -140,11 +140,11 @@ class Priors:
 
     @property
     def of_print(self) -> dict[str, Array]:
-        """Deviations of squares (1,) and pattern (2,), as `layout` names them."""
+        """Standard deviations of squares (1,) and pattern (2,), by the names of `layout`."""
         return {"squares": np.array([self.squares]), "pattern": np.array([self.pattern_m, self.pattern_m])}
 
 
-# Offsets of lasers without any in the profile.
+# Spread of lasers' offsets if the profile has none, m.
 NO_LASER_M = 1e-6
 
 

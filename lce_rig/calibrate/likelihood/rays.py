@@ -167,19 +167,19 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         ring=ring,
         rays=points / range_m[:, None],
         range_m=range_m,
-        fields=_fields(points, T_lidar_board[capture], board),
+        fields=displacements(points, T_lidar_board[capture], board),
         weight=np.array([1.0 if lidar.has_rings else _MEAN_M / lidar.sigma_m for lidar in boards]),
         end_capture=end_capture[sorted_ends],
         end_ring=end_ring[sorted_ends],
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
-        end_fields=_fields(ends, T_lidar_board[end_capture[sorted_ends]], board),
+        end_fields=displacements(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
         end_beam=np.concatenate(beams)[sorted_ends],
     )
 
 
-def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:
+def displacements(points: Array, T_lidar_board: Array, board: Board) -> Array:
     """Compute the displacements (4) to (6) of points (N, 3) on boards (N, 4, 4), frame lidar: (N, 3, 6)."""
     R, t = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3]
     on_board = np.einsum("nji,nj->ni", R, points - t)

@@ -23,7 +23,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
-from lce_rig.judge.findings import advice_of, consequences
+from lce_rig.judge.findings import advice_of
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.overlays.canvas import accumulated
@@ -183,9 +183,9 @@ def _statement(c: Calibration) -> str:
 
 def _reasons(c: Calibration) -> list[tuple[str, str]]:
     """List severity and text of the findings: causes, what follows from them, notes."""
-    following, rows = consequences(c.findings), []
+    rows = []
     for finding in c.findings:
-        if finding.code in following:
+        if finding.follows:
             rows.append(("note", f"Follows: {finding.text}"))
         elif finding.code != _PLAN:
             rows.append((finding.severity, f"{'Note: ' * (finding.severity == 'note')}{finding.text}"))
@@ -194,12 +194,11 @@ def _reasons(c: Calibration) -> list[tuple[str, str]]:
 
 def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     """List the next steps, the most urgent first: the causes' actions, then the checks before use."""
-    following = consequences(c.findings)
     plan = next((finding.advice for finding in c.findings if finding.code == _PLAN), "")
     asked, optional = [], []
     for finding in sorted(c.findings, key=lambda f: f.severity != "error"):
         advice = advice_of(finding, plan, folder)
-        if finding.severity != "note" and finding.code not in following:
+        if finding.severity != "note" and not finding.follows:
             asked.append(advice)
         elif advice and advice != plan and finding.action.startswith("measure"):
             optional.append(f"For less uncertainty, {advice}.")

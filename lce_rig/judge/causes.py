@@ -1,0 +1,271 @@
+"""Findings of the causes that explain the captures: kind, size, and displacement of the extrinsics."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lce_rig.calibrate.likelihood.fit import JointEstimate
+from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
+from lce_rig.calibrate.likelihood.layout import Indices
+from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels
+from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
+from lce_rig.core.findings import Finding, Severity
+from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
+from lce_rig.core.results import Observation
+from lce_rig.judge.contributions import summed_covariance
+from lce_rig.judge.explanations import ALL, MOUNTINGS, SCATTER, Cause, Selected, explain
+from lce_rig.judge.findings import (
+    BOW,
+    DRIFTED,
+    FAIL_FACTOR,
+    FOCUS_DRIFT,
+    LASER_ANGLES,
+    LENS,
+    MOVED,
+    OUTLIER,
+    PATTERN_OFFSET,
+    PLATE_SIZE,
+    RANGE_CONTRAST,
+    RANGE_OFFSET,
+    RANGE_SCALE,
+    SCALE_OFF,
+    SCATTERED,
+    TWO_BOARDS,
+)
+from lce_rig.rig import CalibrationSettings, Rig
+
+# Minimum number of captures to test: the constants alone can absorb fewer.
+_FEWEST = 6
+# Limit of the images' noise that counts as explained, in usual levels: one standard deviation of their prior.
+_USUAL = 2.0
+# Significance limit for an error of the extrinsics in use.
+_CHANCE = 1e-3
+
+
+def find_causes(
+    estimate: CalibrationEstimate,
+    rejected: Sequence[Observation],
+    target: CalibrationSettings,
+    is_of_lidars: bool,
+) -> tuple[Selected, ...]:
+    """Find errors that explain the captures of an estimate better than noise, up to the first reason.
+
+    Args:
+        estimate: of any method.
+        rejected: captures with the board in both sensors that the estimate does not use.
+        target: target standard deviations.
+        is_of_lidars: True for two LiDARs, where only mountings are tested.
+    """
+    if estimate.joint is None or len(estimate.observations) < _FEWEST:
+        return ()
+    joint, camera = estimate.joint
+    seen = sorted([*estimate.observations.values(), *rejected], key=lambda o: o.capture)
+    hypothesis = at_full_weight(joint, seen, estimate.lens, camera)
+    causes = MOUNTINGS if is_of_lidars else ALL
+    found: list[Selected] = []
+    for selected in explain(hypothesis, causes):
+        found.append(_in_use(selected, estimate))
+        if selected.gain.cause != "alone" and _severity(found[-1].change, target) != "note":
+            break
+    return tuple(found)
+
+
+def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
+    """Measure the change from the extrinsics in use, where these are significantly off.
+
+    Method "paper" estimates no constant errors, so its extrinsics may be farther off than the likelihood's.
+    """
+    if selected.gain.cause in MOUNTINGS:
+        return selected
+    apart = difference(selected.after.T_in_use, estimate.T_cam_lidar)
+    cov = estimate.cov + summed_covariance(estimate.sensitivities)
+    is_off = chance_of(float(apart @ np.linalg.solve(cov, apart)), 6) < _CHANCE
+    return selected._replace(change=apart) if is_off else selected
+
+
+def cause_findings(
+    selected: Sequence[Selected], estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str
+) -> list[Finding]:
+    """Report the causes, each with a severity from its displacement of the extrinsics in use.
+
+    The most significant one of the highest severity is the reason. The others are notes, as they may follow
+    from it.
+    """
+    found = [_finding(each, estimate, rig, camera, lidar) for each in selected]
+    told = [each for each in found if each is not None]
+    reason = next((f for s in ("error", "warning") for f in told if f.severity == s), None)
+    if reason is not None:
+        return [reason, *(replace(each, severity="note") for each in told if each is not reason)]
+    ratio = _scatter(estimate.joint[0]) if estimate.joint is not None and not selected else 0.0
+    return [*told, SCATTERED(ratio=ratio)] if ratio > SCATTER else told
+
+
+def is_explained(selected: Sequence[Selected]) -> bool:
+    """Check whether the causes leave about the usual noise, so that symptoms follow from them."""
+    return bool(selected) and selected[-1].after.with_fitted_noise().largest_noise < _USUAL
+
+
+def contradiction_of(
+    selected: Sequence[Selected], findings: Sequence[Finding], used: Sequence[str]
+) -> list[Sensitivity]:
+    """Return the displacement of the extrinsics that resolves the reason, if there is one.
+
+    The result lies between two groups of captures that differ, which gives half of their change. After a move
+    the whole change counts, as either side may hold now.
+
+    Args:
+        selected: the causes.
+        findings: their findings.
+        used: captures of the result.
+    """
+    codes = [each.code for each in findings if each.severity != "note"]
+    for each in selected:
+        code = _CODES[each.gain.cause]
+        if code in codes and not _is_over(each, used):
+            share = 0.5 if each.gain.cause == "groups" else 1.0
+            return [Sensitivity(code.removeprefix("verdict."), 1.0, share * each.change[None])]
+    return []
+
+
+def _is_over(selected: Selected, used: Sequence[str]) -> bool:
+    """Check whether a sensor moved after the first captures and the result uses only later ones."""
+    explanation = selected.gain.explanation
+    if explanation.cause != "moved" or explanation.weights[0] == 0:
+        return False
+    names = zip(selected.after.captures, explanation.weights, strict=True)
+    return not {name for name, weight in names if weight > 0} & set(used)
+
+
+def _scatter(joint: JointEstimate) -> float:
+    """Return the largest level of the images' errors, in units of the usual one."""
+    return max(float(getattr(joint.levels, name) / getattr(Levels(), name)) for name in OF_IMAGES)
+
+
+def _severity(change: Array, target: CalibrationSettings) -> Severity:
+    """Return the severity of a change (6,) of the extrinsics in use, in units of the targets."""
+    size = target.in_targets(*tangent_sizes(change))
+    if size <= 1:
+        return "note"
+    return "error" if size > FAIL_FACTOR else "warning"
+
+
+def _finding(
+    selected: Selected, estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str
+) -> Finding | None:
+    """Report one cause; None for a single capture that the result does not use."""
+    cause, after = selected.gain.cause, selected.after
+    rotation_deg, translation_m = tangent_sizes(selected.change)
+    severity = _severity(selected.change, rig.calibration)
+    apart: dict[str, Any] = {"rotation_deg": rotation_deg, "translation_m": translation_m}
+    if cause in MOUNTINGS:
+        return _of_mounting(selected, estimate, apart, severity)
+    name = rig.lidars[lidar]
+    at, board, n = after.state.layout, rig.board, len(after.captures)
+    z, cov = after.state.z, after.reduced.cost.covariance()
+    figures: dict[str, Any] = {"severity": severity, **apart}
+
+    def value(columns: Indices) -> tuple[float, float]:
+        return float(z[columns].mean()), float(np.sqrt(cov[columns[:, None], columns].mean()))
+
+    if cause == "squares":
+        scale, sigma = value(at.z.of(["squares"]))
+        return SCALE_OFF(
+            scale=-scale,
+            scale_sigma=sigma,
+            square_m=board.square_m * (1 + scale),
+            profile_square_m=board.square_m,
+            **figures,
+        )
+    if cause == "range_offset":
+        offset_m, sigma_m = value(at.lasers[0])
+        return RANGE_OFFSET(
+            lidar, offset_m=offset_m, sigma_m=sigma_m, enter_m=name.range_offset_m + offset_m, **figures
+        )
+    if cause == "range_scale":
+        scale, sigma = value(at.z.of(["stretch"]))
+        return RANGE_SCALE(lidar, scale=scale, scale_sigma=sigma, **figures)
+    if cause == "range_contrast":
+        contrast_m, sigma_m = value(at.z.of(["contrast"]))
+        return RANGE_CONTRAST(lidar, contrast_m=contrast_m, sigma_m=sigma_m, **figures)
+    if cause == "pattern":
+        place = at.z.of(["pattern"])
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[place[:, None], place])[-1]))
+        right_m, up_m = z[place].tolist()
+        return PATTERN_OFFSET(right_m=right_m, up_m=up_m, sigma_m=sigma_m, n_captures=n, **figures)
+    if cause == "plate":
+        k = int(np.argmax(np.abs(z[at.plate])))
+        side, profile_m = (("width", board.width_m), ("height", board.height_m))[k]
+        # The likelihood does not separate the plate's size from the edge shift; the scans' outlines do.
+        qualities = [o.lidar.quality for o in estimate.observations.values()]
+        sizes = [(getattr(q, f"{side}_m"), getattr(q, f"{side}_sigma_m")) for q in qualities]
+        measured_m, sigma_m = np.median(sizes, axis=0).tolist()
+        return PLATE_SIZE(
+            side=side, measured_m=measured_m, sigma_m=sigma_m, profile_m=profile_m, n_captures=n, **figures
+        )
+    if cause == "bow":
+        bows = z[at.z.of(["bow"])]
+        k = int(np.argmax(np.abs(bows)))
+        return BOW(side=("width", "height")[k], bow_m=abs(float(bows[k])), **figures)
+    if cause in ("azimuths", "elevations"):
+        errors = z[at.lasers[1 if cause == "azimuths" else 2]]
+        rms_deg = float(np.degrees(np.std(errors)))
+        return LASER_ANGLES(lidar, angle=cause.removesuffix("s"), rms_deg=rms_deg, **figures)
+    if cause == "lens":
+        return LENS(camera, **figures)
+    share = float(selected.gain.value[0])
+    if cause == "two_boards":
+        return TWO_BOARDS(capture=after.captures[selected.gain.explanation.cut], share=share, **figures)
+    return FOCUS_DRIFT(camera, share=share, **figures)
+
+
+def _of_mounting(
+    selected: Selected, estimate: CalibrationEstimate, apart: dict[str, Any], severity: Severity
+) -> Finding | None:
+    """Report captures with another mounting, or a mounting that drifts."""
+    explanation, names = selected.gain.explanation, selected.after.captures
+    chance = float(10.0**selected.gain.log10_chance)
+    if explanation.cause == "drift":
+        return DRIFTED(severity=severity, chance=chance, **apart)
+    captures = tuple(name for name, w in zip(names, explanation.weights, strict=True) if w > 0)
+    is_unused = not set(captures) & set(estimate.used)
+    if explanation.cause == "alone":
+        if is_unused:
+            return None
+        # A note: its weight in the result is small.
+        return OUTLIER(severity="note", capture=captures[0], **apart)
+    place, neighbour = "", ""
+    if explanation.cause == "moved":
+        is_first = explanation.weights[0] > 0
+        place = "first" if is_first else "last"
+        neighbour = names[explanation.cut if is_first else explanation.cut - 1]
+    return MOVED(
+        severity="warning" if severity == "error" and _is_over(selected, estimate.used) else severity,
+        captures=captures,
+        n_captures=len(captures),
+        place=place,
+        neighbour=neighbour,
+        chance=chance,
+        **apart,
+    )
+
+
+_CODES: dict[Cause, str] = {
+    "squares": SCALE_OFF.code,
+    "pattern": PATTERN_OFFSET.code,
+    "plate": PLATE_SIZE.code,
+    "bow": BOW.code,
+    "lens": LENS.code,
+    "range_offset": RANGE_OFFSET.code,
+    "range_scale": RANGE_SCALE.code,
+    "range_contrast": RANGE_CONTRAST.code,
+    "azimuths": LASER_ANGLES.code,
+    "elevations": LASER_ANGLES.code,
+    "moved": MOVED.code,
+    "groups": MOVED.code,
+    "alone": OUTLIER.code,
+    "drift": DRIFTED.code,
+    "focus_drift": FOCUS_DRIFT.code,
+    "two_boards": TWO_BOARDS.code,
+}
