@@ -20,7 +20,7 @@ Part = Callable[[Any, argparse.Namespace], None]
 PARTS: dict[str, tuple[str, Part]] = {
     "real": (
         "recordings by others: references, halves, channels",
-        lambda bench, a: bench(a.splits, a.only, a.methods),
+        lambda bench, a: bench(a.splits, a.only, a.methods or "ml"),
     ),
     "sessions": ("recordings of one rig: what moved between them", lambda bench, _: bench()),
     "simulated": ("boards held still: error against exact truth", lambda bench, a: bench(a.seeds or 20)),
@@ -31,8 +31,8 @@ PARTS: dict[str, tuple[str, Part]] = {
         lambda bench, a: bench(a.seeds or 20, a.output),
     ),
     "corruptions": (
-        "sessions that are wrong as a whole: verdict, error and claim",
-        lambda bench, a: bench(a.only),
+        "sessions that are wrong as a whole: verdict, first cause, error",
+        lambda bench, a: bench(a.only, a.kinds, a.methods, a.jobs, a.draws),
     ),
     "uncertainty": (
         "the joint estimate: errors against their bound, coverage of its claim",
@@ -76,7 +76,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="simulated sessions")
     parser.add_argument("--splits", type=int, default=20, help="random split halves (default 20)")
     parser.add_argument("--only", default="", help="sets whose name contains this")
-    parser.add_argument("--methods", default="ml", help="of `real`: ml or paper (default ml)")
+    parser.add_argument(
+        "--methods", help="ml or paper, of `real` (default ml) and of `corruptions` (default both)"
+    )
+    parser.add_argument("--kinds", default="", help="of `corruptions`: those whose name contains this")
+    parser.add_argument("--jobs", type=int, default=1, help="of `corruptions`: processes (default 1)")
+    parser.add_argument(
+        "--draws", type=int, default=0, help="of `corruptions`: random halves of sound sessions instead"
+    )
     parser.add_argument("--captures", type=int, help="captures of a simulated session")
     parser.add_argument("--seconds", type=float, help="of `live` (60) and of the bag of `offline` (15)")
     parser.add_argument(

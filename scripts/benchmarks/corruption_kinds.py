@@ -10,13 +10,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import corruption_causes as causes
+from benchmarks.corruption_causes import Codes
+from benchmarks.corruption_detections import (
+    Spoil,
+    with_bow,
+    with_contrast,
+    with_focus_drift,
+    with_rolling_shutter,
+    with_second_board,
+)
 from benchmarks.corruption_sessions import LATE_S, ONE_PLACE, PARALLEL, Samples, late
+from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.rig import BoardSettings, IntrinsicsSettings, Rig, dump_rig, parse_rig
 
+SOUND = "none"
 Corrupt = Callable[[Samples], Samples | None]
 _FOOT_M = 0.3048
+# Standard deviations of the profile's own entry that an error within its tolerance may have.
+_BEYOND = 3.0
 _SEED = 12
 
 
@@ -27,17 +41,31 @@ class Corruption:
     Attributes:
         name: in the table.
         corrupt: the session.
+        causes: codes of the findings that name it; any of them is right.
         unobservable: why the samples of the session cannot show it, in words; empty where they can.
+        sigmas: its size in standard deviations of the profile's entry, from the sound profile; None where the
+            profile has no entry for it.
+        spoil: the detections, after those of the session are found; None leaves them.
     """
 
     name: str
     corrupt: Corrupt
+    causes: Codes
     unobservable: str = ""
+    sigmas: Callable[[Rig], float] | None = None
+    spoil: Spoil | None = None
+
+    def is_beyond(self, rig: Rig) -> bool:
+        """Tell whether it is larger than the sound profile allows for."""
+        try:
+            return self.sigmas is None or self.sigmas(rig) > _BEYOND
+        except ZeroDivisionError:
+            return True  # the profile states the figure as exact
 
 
 def corruptions() -> list[Corruption]:
     """List all of them, the sound session first."""
-    return [Corruption("none", lambda samples: samples), *_all()]
+    return [Corruption(SOUND, _same, causes.NOTHING), *_all()]
 
 
 def _all() -> Iterator[Corruption]:
@@ -49,9 +77,11 @@ def _all() -> Iterator[Corruption]:
     yield from _elevations()
     yield from _other_places()
     yield from _at_the_ends()
+    yield from _drifting()
     yield from _lenses()
     yield from _prints()
     yield from _timing()
+    yield from _readout()
     yield from _noise()
     yield from _too_little()
 
@@ -60,13 +90,16 @@ def _all() -> Iterator[Corruption]:
 
 
 def _swapped() -> Iterator[Corruption]:
-    yield Corruption("images of 2 captures swapped", lambda s: _cycled(s, _some(s, 2)))
-    yield Corruption("images of 5 captures mixed up", lambda s: _cycled(s, _some(s, 5)))
+    few = causes.EXCHANGED | causes.OUTLIER
+    yield Corruption("images of 2 captures swapped", lambda s: _cycled(s, _some(s, 2)), few)
+    yield Corruption("images of 5 captures mixed up", lambda s: _cycled(s, _some(s, 5)), causes.NO_ORDER)
     yield Corruption(
-        "images of half the captures mixed up", lambda s: _cycled(s, _some(s, (len(s.images) + 1) // 2))
+        "images of half the captures mixed up",
+        lambda s: _cycled(s, _some(s, (len(s.images) + 1) // 2)),
+        causes.NO_ORDER,
     )
-    yield Corruption("images in reversed order", lambda s: _dealt(s, s.captures[::-1]))
-    yield Corruption("images one capture late", lambda s: _cycled(s, s.captures))
+    yield Corruption("images in reversed order", lambda s: _dealt(s, s.captures[::-1]), causes.OTHER_ORDER)
+    yield Corruption("images one capture late", lambda s: _cycled(s, s.captures), causes.OTHER_ORDER)
 
 
 def _some(samples: Samples, n: int) -> list[str]:
@@ -98,14 +131,19 @@ def _mirrored() -> Iterator[Corruption]:
     def across(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return pixels[:, ::-1]
 
-    yield Corruption("images mirrored left to right", lambda s: _with_images(s, across))
-    yield Corruption("every other image mirrored left to right", lambda s: _every_other(s, across))
-    yield Corruption("images mirrored top to bottom", lambda s: _with_images(s, lambda p: p[::-1]))
-    yield Corruption("scans mirrored, y to -y", lambda s: _with_points(s, lambda p: p * [1, -1, 1]))
-    yield Corruption("x and y of scans swapped", lambda s: _with_points(s, lambda p: p[:, [1, 0, 2]]))
+    mirrored: tuple[tuple[str, Corrupt], ...] = (
+        ("images mirrored left to right", lambda s: _with_images(s, across)),
+        ("every other image mirrored left to right", lambda s: _every_other(s, across)),
+        ("images mirrored top to bottom", lambda s: _with_images(s, lambda p: p[::-1])),
+        ("scans mirrored, y to -y", lambda s: _with_points(s, lambda p: p * [1, -1, 1])),
+        ("x and y of scans swapped", lambda s: _with_points(s, lambda p: p[:, [1, 0, 2]])),
+    )
+    for label, corrupt in mirrored:
+        yield Corruption(label, corrupt, causes.MIRRORED)
     yield Corruption(
         "images and scans mirrored alike",
         lambda s: _with_points(_with_images(s, across), lambda p: p * [1, -1, 1]),
+        causes.MIRRORED | causes.NOMINAL,
         "a mirrored world seen by mirrored sensors is as consistent as the true one",
     )
 
@@ -123,22 +161,25 @@ def _frames() -> Iterator[Corruption]:
         yield Corruption(
             f"scans in a frame {up_m:g} m below the LiDAR",
             lambda s, up_m=up_m: _with_points(s, lambda p: p + [0, 0, up_m]),  # type: ignore[misc]
+            causes.OTHER_FRAME,
         )
-    yield Corruption("nominal pose inverted", _with_inverted_nominal)
+    yield Corruption("nominal pose inverted", _with_inverted_nominal, causes.NOMINAL)
 
 
 def _with_inverted_nominal(samples: Samples) -> Samples | None:
-    if not samples.rig.nominal_extrinsics:
+    # Poses that are typical of a rig are compared with nothing.
+    if all(entry.source != "cad" for entry in samples.rig.nominal_extrinsics):
         return None
     nominal = tuple(entry.corrections()["inverted"] for entry in samples.rig.nominal_extrinsics)
     return _with_rig(samples, samples.rig.model_copy(update={"nominal_extrinsics": nominal}))
 
 
 def _turned() -> Iterator[Corruption]:
-    yield Corruption("images rotated by 90 deg", lambda s: _with_images(s, np.rot90))
+    yield Corruption("images rotated by 90 deg", lambda s: _with_images(s, np.rot90), causes.OTHER_IMAGES)
     yield Corruption(
         "images rotated by 180 deg",
         lambda s: _with_images(s, lambda p: np.rot90(p, 2)),
+        causes.NOMINAL | causes.LENS,
         "but for the principal point, a camera that is mounted upside down takes these images",
     )
     for angle_deg in (5, 30, 90, 180):
@@ -146,6 +187,7 @@ def _turned() -> Iterator[Corruption]:
         yield Corruption(
             f"scans rotated by {angle_deg} deg about z",
             lambda s, T=T: _with_points(s, lambda p: transform(T, p)),  # type: ignore[misc]
+            causes.NOMINAL,
             "a LiDAR that is mounted with another yaw takes these scans",
         )
 
@@ -155,10 +197,12 @@ def _scaled() -> Iterator[Corruption]:
         yield Corruption(
             f"scans scaled {label}",
             lambda s, factor=factor: _with_points(s, lambda p: factor * p),  # type: ignore[misc]
+            causes.SCALED if "by" in label else causes.OTHER_UNIT,
         )
     yield Corruption(
         "scans and board scaled by 1.02",
         lambda s: _with_board(_with_points(s, lambda p: 1.02 * p), _scaled_board(s.rig, 1.02)),
+        causes.SCALED,
         "with another metre everywhere everything fits",
     )
 
@@ -168,14 +212,16 @@ def _elevations() -> Iterator[Corruption]:
         yield Corruption(
             f"elevations wrong by -{error_deg:g} to +{error_deg:g} deg",
             lambda s, error_deg=error_deg: _with_elevations(s, np.radians(error_deg)),  # type: ignore[misc]
+            causes.LASERS,
         )
     for angle in ("elevations", "azimuths"):
         yield Corruption(
             f"{angle} of every other ring wrong by +-0.5 deg",
             lambda s, angle=angle: _with_other_table(s, angle),  # type: ignore[misc]
+            causes.LASERS,
         )
     # Whoever reads such a point cloud counts its rings from the lowest.
-    yield Corruption("elevations in reversed order", _upside_down)
+    yield Corruption("elevations in reversed order", _upside_down, causes.MIRRORED | causes.LASERS)
 
 
 def _upside_down(samples: Samples) -> Samples:
@@ -229,19 +275,38 @@ def _other_places() -> Iterator[Corruption]:
         yield Corruption(
             f"a quarter of the captures from a rig nudged by {label}",
             lambda s, T=T: _nudged(s, s.captures[1::4], T),  # type: ignore[misc]
+            causes.MOVED,
         )
     for label, T in (("1 deg", _about_z(1)), ("5 cm", _aside(0.05))):
         yield Corruption(
             f"every other capture from a rig nudged by {label}",
             lambda s, T=T: _nudged(s, s.captures[1::2], T),  # type: ignore[misc]
+            causes.MOVED,
         )
-    for label, T in (("0.5 deg", _about_z(0.5)), ("1 deg", _about_z(1)), ("5 cm", _aside(0.05))):
+    yield Corruption(
+        "every third capture from a rig nudged by 0.8 deg and 15 mm",
+        lambda s: _nudged(s, s.captures[::3], _NUDGE),
+        causes.MOVED,
+    )
+    for label, T in (
+        ("0.5 deg", _about_z(0.5)),
+        ("1 deg", _about_z(1)),
+        ("5 cm", _aside(0.05)),
+        ("0.8 deg and 15 mm", _NUDGE),
+    ):
         # Where the LiDAR stands in the end counts.
         yield Corruption(
             f"LiDAR nudged by {label} half-way",
             lambda s, T=T: replace(  # type: ignore[misc]
                 _nudged(s, s.captures[len(s.captures) // 2 :], T), T_lidar_moved=T
             ),
+            causes.MOVED,
+        )
+    for label, T in (("3 deg", _about_z(3)), ("1.5 deg and 30 mm", _about_z(1.5) @ _aside(0.03))):
+        yield Corruption(
+            f"one capture from a rig nudged by {label}",
+            lambda s, T=T: _nudged(s, [s.captures[len(s.captures) // 3]], T),  # type: ignore[misc]
+            causes.OUTLIER,
         )
 
 
@@ -254,13 +319,39 @@ def _at_the_ends() -> Iterator[Corruption]:
             yield Corruption(
                 f"LiDAR turned by {angle_deg:g} deg before the last {last}",
                 lambda s, n=n, T=T: replace(_nudged(s, s.captures[-n:], T), T_lidar_moved=T),  # type: ignore[misc]
+                causes.LAST if n == 1 else causes.MOVED,
                 "one capture that disagrees may be of a board that moved" if n == 1 else "",
             )
         for n in (2, 3):
             yield Corruption(
                 f"LiDAR turned by {angle_deg:g} deg after the first {n} captures",
                 lambda s, n=n, T=T: _nudged(s, s.captures[:n], T),  # type: ignore[misc]
+                causes.MOVED,
             )
+    yield Corruption(
+        "LiDAR nudged by 0.8 deg and 15 mm before the last 3 captures",
+        lambda s: replace(_nudged(s, s.captures[-3:], _NUDGE), T_lidar_moved=_NUDGE),
+        causes.MOVED,
+    )
+
+
+def _drifting() -> Iterator[Corruption]:
+    """Change the mounting, or the focus, slowly from the first capture to the last."""
+    yield Corruption("LiDAR drifts by 1 deg", lambda s: _drifted(s, 1.0), causes.DRIFT)
+    yield Corruption(
+        "focal length drifts by 1 %",
+        _same,
+        causes.FOCUS_DRIFT,
+        spoil=lambda rig, found, _: with_focus_drift(rig, found, 0.01),
+    )
+
+
+def _drifted(samples: Samples, angle_deg: float) -> Samples:
+    """Turn the LiDAR about z, in proportion to the captures' numbers; where it stands in the end counts."""
+    names, scans = samples.captures, dict(samples.scans)
+    for name, part in zip(names, np.linspace(0, 1, len(names)), strict=True):
+        scans[name] = _nudged(samples, [name], _about_z(angle_deg * float(part))).scans[name]
+    return replace(samples, scans=scans, T_lidar_moved=_about_z(angle_deg))
 
 
 def _nudged(samples: Samples, names: Sequence[str], T_lidar_moved: Array) -> Samples:
@@ -284,6 +375,13 @@ def _aside(shift_m: float) -> Array:
     return pose(np.eye(3), shift_m * np.sqrt([0.5, 0.5, 0.0]))
 
 
+# 0.8 deg about a slanted axis, and 15 mm.
+_NUDGE = pose(
+    exp_so3(np.radians(0.8) * np.array([0.3, 0.3, 0.9]) / np.linalg.norm([0.3, 0.3, 0.9])),
+    0.015 * np.array([0.6, 0.0, 0.8]),
+)
+
+
 # Intrinsics that belong to another lens, or to another mode of the camera.
 
 
@@ -295,22 +393,51 @@ def _lenses() -> Iterator[Corruption]:
             lambda s, f=factor: _with_lens(  # type: ignore[misc]
                 s, lambda lens: {"fx_px": f * lens.fx_px, "fy_px": f * lens.fy_px}
             ),
+            causes.LENS,
+            sigmas=lambda rig, percent=percent: abs(percent) / 100 / _known(rig).lens.focal_length,  # type: ignore[misc]
         )
     yield Corruption(
-        "principal point of the profile 5 px right", lambda s: _with_lens(s, lambda k: {"cx_px": k.cx_px + 5})
+        "principal point of the profile 5 px right",
+        lambda s: _with_lens(s, lambda k: {"cx_px": k.cx_px + 5}),
+        causes.LENS,
+        sigmas=lambda rig: 5 / _known(rig).lens.principal_point_px,
     )
     yield Corruption(
-        "principal point of the profile 20 px up", lambda s: _with_lens(s, lambda k: {"cy_px": k.cy_px - 20})
+        "principal point of the profile 20 px up",
+        lambda s: _with_lens(s, lambda k: {"cy_px": k.cy_px - 20}),
+        causes.LENS,
+        sigmas=lambda rig: 20 / _known(rig).lens.principal_point_px,
     )
     yield Corruption(
         "distortion of the profile zero",
         lambda s: _with_lens(s, lambda k: {"distortion": (0.0,) * len(k.distortion)}),
+        causes.DISTORTION,
+        sigmas=_sigmas_of_distortion,
     )
-    yield Corruption("images of half the resolution", lambda s: _with_images(s, _halved))
+    yield Corruption("images of half the resolution", lambda s: _with_images(s, _halved), causes.OTHER_IMAGES)
     yield Corruption(
         "images and resolution halved, other intrinsics unchanged",
         lambda s: _with_resolution_halved(_with_images(s, _halved)),
+        causes.OTHER_IMAGES | causes.LENS,
     )
+
+
+def _known(rig: Rig) -> Tolerances:
+    """Return the standard deviations in a profile of one camera."""
+    return Tolerances.of(next(iter(rig.cameras.values())), rig.board)
+
+
+def _sigmas_of_distortion(rig: Rig) -> float:
+    """Compare the displacement of pixels by the distortion with its standard deviation.
+
+    Half-way to the corner, where every lens model is defined: there it is an eighth of the corner's.
+    """
+    known = _known(rig).lens
+    lens = known.lens
+    pixels = np.array([[lens.cx_px, lens.cy_px]]) / 2
+    rays = replace(lens, distortion=(0.0,) * len(lens.distortion)).unproject(pixels)
+    distorted, _ = lens.project(rays)
+    return float(np.linalg.norm(distorted - pixels)) / (known.distortion_px / 8)
 
 
 def _halved(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -337,11 +464,15 @@ def _prints() -> Iterator[Corruption]:
         yield Corruption(
             f"squares of the profile {percent:+g} %",
             lambda s, f=factor: _with_board(s, {"square_m": f * s.rig.board.square_m}),  # type: ignore[misc]
+            causes.SQUARES,
+            sigmas=lambda rig, f=factor: abs(f - 1) / _known(rig).square_size,  # type: ignore[misc]
         )
     for offset_m in (0.01, 0.02):
         yield Corruption(
             f"pattern {1000 * offset_m:.0f} mm off the plate's centre",
             lambda s, offset_m=offset_m: _with_board(s, _off_centre(s.rig.board, offset_m)),  # type: ignore[misc]
+            causes.PATTERN,
+            sigmas=lambda rig, offset_m=offset_m: offset_m / _known(rig).pattern_offset_m,  # type: ignore[misc]
         )
     for added_m in (0.01, 0.02, 0.035):
         yield Corruption(
@@ -349,11 +480,33 @@ def _prints() -> Iterator[Corruption]:
             lambda s, added_m=added_m: _with_board(  # type: ignore[misc]
                 s, {"width_m": s.rig.board.width_m + added_m, "height_m": s.rig.board.height_m + added_m}
             ),
+            causes.PLATE,
+            sigmas=lambda rig, added_m=added_m: added_m / _known(rig).plate_m,  # type: ignore[misc]
         )
-    yield Corruption("one more row of corners in the profile", lambda s: _with_corners(s, 0, 1))
-    yield Corruption("one column of corners fewer in the profile", lambda s: _with_corners(s, -1, 0))
     yield Corruption(
-        "board scaled by 1.02 in the profile", lambda s: _with_board(s, _scaled_board(s.rig, 1.02))
+        "plate bowed by 8 mm",
+        _same,
+        causes.BOW,
+        sigmas=lambda rig: 0.008 / _known(rig).bow_m,
+        spoil=lambda rig, found, _: with_bow(rig, found, 0.008),
+    )
+    yield Corruption(
+        "squares of the second half of the captures 10 % smaller",
+        _same,
+        causes.TWO_BOARDS,
+        spoil=lambda rig, found, _: with_second_board(rig, found, 0.9),
+    )
+    yield Corruption(
+        "one more row of corners in the profile", lambda s: _with_corners(s, 0, 1), causes.OTHER_CORNERS
+    )
+    yield Corruption(
+        "one column of corners fewer in the profile", lambda s: _with_corners(s, -1, 0), causes.OTHER_CORNERS
+    )
+    yield Corruption(
+        "board scaled by 1.02 in the profile",
+        lambda s: _with_board(s, _scaled_board(s.rig, 1.02)),
+        causes.SCALED,
+        sigmas=lambda rig: 0.02 / _known(rig).square_size,
     )
 
 
@@ -380,12 +533,25 @@ def _scaled_board(rig: Rig, factor: float) -> dict[str, object]:
 
 
 def _timing() -> Iterator[Corruption]:
-    yield Corruption("timestamps of images mixed up", _with_mixed_stamps)
+    # Boards stand still, or samples are paired already.
+    yield Corruption(
+        "timestamps of images mixed up", _with_mixed_stamps, causes.TIME_OFFSET, sigmas=lambda _: 0.0
+    )
     for name in map(late, LATE_S):
         yield Corruption(
             f"board moving, timestamps of images {name}",
             lambda s, name=name: s.variants.get(name),  # type: ignore[misc]
+            causes.TIME_OFFSET,
         )
+
+
+def _readout() -> Iterator[Corruption]:
+    yield Corruption(
+        "board moves at 0.15 m/s, rows read out over 20 ms",
+        _same,
+        causes.READOUT,
+        spoil=lambda rig, found, _: with_rolling_shutter(rig, found, 0.02, 0.15),
+    )
 
 
 def _with_mixed_stamps(samples: Samples) -> Samples | None:
@@ -404,16 +570,27 @@ def _with_mixed_stamps(samples: Samples) -> Samples | None:
 
 
 def _noise() -> Iterator[Corruption]:
-    for offset_m in (0.03, 0.1):
+    for offset_m in (0.03, 0.06, 0.1):
         yield Corruption(
             f"ranges {100 * offset_m:.0f} cm too long",
             lambda s, offset_m=offset_m: _with_ranges(s, lambda r, _: r + offset_m),  # type: ignore[misc]
+            causes.RANGE_OFFSET,
+            sigmas=lambda rig, offset_m=offset_m: (  # type: ignore[misc]
+                offset_m / next(iter(rig.lidars.values())).range_offset_sigma_m
+            ),
         )
+    yield Corruption(
+        "ranges 15 mm longer on dark squares",
+        _same,
+        causes.RANGE_CONTRAST,
+        spoil=lambda rig, found, T_cam_lidar: with_contrast(rig, found, T_cam_lidar, 0.015),
+    )
     yield Corruption(
         "ranges with 5 cm of noise",
         lambda s: _with_ranges(s, lambda r, rng: r + 0.05 * rng.standard_normal(len(r))),
+        causes.SCATTER,
     )
-    yield Corruption("every other ring lost", _with_half_the_rings)
+    yield Corruption("every other ring lost", _with_half_the_rings, causes.FEW_RINGS, sigmas=lambda _: 0.0)
 
 
 def _with_ranges(samples: Samples, change: Callable[[Array, np.random.Generator], Array]) -> Samples:
@@ -436,10 +613,14 @@ def _too_little() -> Iterator[Corruption]:
         yield Corruption(
             f"only {n} captures",
             lambda s, n=n: _only(s, s.captures[:n]),  # type: ignore[misc]
+            causes.FEW,
         )
-    yield Corruption("one capture 10 times", _copied)
-    yield Corruption("boards nearly parallel", lambda s: s.variants.get(PARALLEL))
-    yield Corruption("board always in one place", lambda s: s.variants.get(ONE_PLACE))
+    yield Corruption("one capture 10 times", _copied, causes.FEW)
+    # With a covariance within the targets, nothing is wrong with them.
+    yield Corruption(
+        "boards nearly parallel", lambda s: s.variants.get(PARALLEL), causes.FEW, sigmas=lambda _: 0.0
+    )
+    yield Corruption("board always in one place", lambda s: s.variants.get(ONE_PLACE), causes.FEW)
 
 
 def _only(samples: Samples, names: Sequence[str]) -> Samples:
@@ -458,6 +639,10 @@ def _copied(samples: Samples) -> Samples:
 
 
 # What all of them are made of.
+
+
+def _same(samples: Samples) -> Samples:
+    return samples
 
 
 def _with_images(samples: Samples, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Samples:

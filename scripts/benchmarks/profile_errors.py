@@ -46,7 +46,7 @@ def with_profile_errors(
         pattern_offset_m=tuple(board.pattern_offset_m + known.pattern_offset_m * rng.standard_normal(2)),
     ).corners()
     bows_m = known.bow_m * rng.standard_normal(2)
-    corners = corners + sum(_bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
+    corners = corners + sum(bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
     offset_m = of_lidar.range_offset_sigma_m * float(rng.standard_normal())
     images: dict[str, ImageBoard] = {}
     for name, T_cam_board in session.T_cam_board.items():
@@ -122,7 +122,7 @@ def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
 
 def _as_scanned(lidar: LidarBoard, board: Board, bows_m: Array, offset_m: float) -> LidarBoard:
     for axis, height_m in enumerate(bows_m):
-        lidar = _bend(lidar, axis, float(height_m), board)
+        lidar = bend(lidar, axis, float(height_m), board)
     return _lengthened(lidar, offset_m)
 
 
@@ -142,7 +142,7 @@ def _lengthened(lidar: LidarBoard, offset_m: float) -> LidarBoard:
     )
 
 
-def _bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
+def bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
     """Compute shifts (M, 3) of points along the board's normal onto a parabola, highest in the middle."""
     half = (board.width_m, board.height_m)[axis] / 2
     shifts = np.zeros_like(points_board)
@@ -150,7 +150,7 @@ def _bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array
     return shifts
 
 
-def _bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:
+def bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:
     """Bend the plate that a scan shows: its points move along their rays, and the plane is fitted again.
 
     Args:
@@ -163,7 +163,7 @@ def _bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarB
     normal = lidar.plane[:3]
 
     def onto(points: Array) -> Array:
-        height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+        height = bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
         rays = points / np.linalg.norm(points, axis=1, keepdims=True)
         along = rays @ normal
         # A ray that grazes the board would move its point far along it.
@@ -171,7 +171,7 @@ def _bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarB
 
     points = np.asarray(lidar.points, dtype=np.float64)
     centred = points - points.mean(axis=0)
-    height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+    height = bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
     # The plane z = a + b . p fitted to the heights tilts by b and rises by a.
     inside = centred - (centred @ normal)[:, None] * normal
     slope = np.linalg.lstsq(inside, height - height.mean(), rcond=1e-6)[0]

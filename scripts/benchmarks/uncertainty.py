@@ -288,7 +288,7 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors) -> Array:
         priors: of the constant errors.
     """
     information = assemble(terms, levels, priors).cost.information
-    (J,) = extrinsics_by_unknowns(terms.state)
+    (J,) = extrinsics_by_unknowns(terms)
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 
 
@@ -308,7 +308,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     return linearise(
-        scans, (pictures,), board, State.without_errors(T[None], T_lidar_board, len(scans.rings))
+        scans, (pictures,), board, State.without_errors(T[None], T_lidar_board, len(scans.rings), [0])
     )
 
 
