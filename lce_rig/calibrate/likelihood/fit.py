@@ -263,10 +263,14 @@ def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: fl
     """
     steps: list[Array] = []
     moves: list[Array] = []
+    finite = terms
     for _ in range(n_steps):
         reduced = assemble(terms, levels, priors)
         # Far from any optimum steps may diverge: keep the last finite terms.
-        if not short**2 <= reduced.decrement < _DIVERGED:
+        if not reduced.decrement < _DIVERGED:
+            return finite
+        finite = terms
+        if reduced.decrement < short**2:
             break
         z, y = reduced.step
         move = step = np.append(z, y)
