@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
 from lce_rig.calibrate.likelihood.layout import Indices
-from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
 from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
@@ -98,13 +96,15 @@ def cause_findings(
     reason = next((f for s in ("error", "warning") for f in told if f.severity == s), None)
     if reason is not None:
         return [reason, *(replace(each, severity="note") for each in told if each is not reason)]
-    ratio = _scatter(estimate.joint[0]) if estimate.joint is not None and not selected else 0.0
-    return [*told, SCATTERED(ratio=ratio)] if ratio > SCATTER else told
+    if selected or estimate.joint is None:
+        return told
+    ratio = estimate.joint[0].levels.largest_of_images
+    return [SCATTERED(ratio=ratio)] if ratio > SCATTER else []
 
 
 def is_explained(selected: Sequence[Selected]) -> bool:
     """Check whether the causes leave about the usual noise, so that symptoms follow from them."""
-    return bool(selected) and selected[-1].after.with_fitted_noise().largest_noise < _USUAL
+    return bool(selected) and selected[-1].after.with_fitted_noise.levels.largest_of_images < _USUAL
 
 
 def contradiction_of(
@@ -138,11 +138,6 @@ def _is_over(selected: Selected, used: Sequence[str]) -> bool:
     return not {name for name, weight in names if weight > 0} & set(used)
 
 
-def _scatter(joint: JointEstimate) -> float:
-    """Return the largest level of the images' errors, in units of the usual one."""
-    return max(float(getattr(joint.levels, name) / getattr(Levels(), name)) for name in OF_IMAGES)
-
-
 def _severity(change: Array, target: CalibrationSettings) -> Severity:
     """Return the severity of a change (6,) of the extrinsics in use, in units of the targets."""
     size = target.in_targets(*tangent_sizes(change))
@@ -161,7 +156,6 @@ def _finding(
     apart: dict[str, Any] = {"rotation_deg": rotation_deg, "translation_m": translation_m}
     if cause in MOUNTINGS:
         return _of_mounting(selected, estimate, apart, severity)
-    name = rig.lidars[lidar]
     at, board, n = after.state.layout, rig.board, len(after.captures)
     z, cov = after.state.z, after.reduced.cost.covariance()
     figures: dict[str, Any] = {"severity": severity, **apart}
@@ -180,9 +174,8 @@ def _finding(
         )
     if cause == "range_offset":
         offset_m, sigma_m = value(at.lasers[0])
-        return RANGE_OFFSET(
-            lidar, offset_m=offset_m, sigma_m=sigma_m, enter_m=name.range_offset_m + offset_m, **figures
-        )
+        enter_m = rig.lidars[lidar].range_offset_m + offset_m
+        return RANGE_OFFSET(lidar, offset_m=offset_m, sigma_m=sigma_m, enter_m=enter_m, **figures)
     if cause == "range_scale":
         scale, sigma = value(at.z.of(["stretch"]))
         return RANGE_SCALE(lidar, scale=scale, scale_sigma=sigma, **figures)

@@ -197,14 +197,20 @@ class Poses(NamedTuple):
             self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
         )
 
-    def candidates(self) -> Iterator[Explanation]:
-        """List moves before each capture, single captures, the two groups that differ most, and a drift."""
+    def moves(self) -> Iterator[Explanation]:
+        """List moves before each capture."""
         F = len(self.gradient)
         order, cuts = np.arange(F), range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1)
         for cut in cuts:
             # The smaller side gets the mounting of its own.
             is_own = order < cut if 2 * cut < F else order >= cut
             yield Explanation("moved", is_own.astype(np.float64), len(cuts), cut)
+
+    def candidates(self) -> Iterator[Explanation]:
+        """List moves before each capture, single captures, the two groups that differ most, and a drift."""
+        yield from self.moves()
+        F = len(self.gradient)
+        order = np.arange(F)
         for k in order:
             yield Explanation("alone", (order == k).astype(np.float64), F)
         if F >= _FEWEST_IN_GROUPS and np.count_nonzero(np.diff(members := self.divide())) > 1:
@@ -303,20 +309,17 @@ class Table:
 
         Far from the common optimum their cost is not quadratic, and (2) understates what they gain.
         """
-        is_further, found = self.hypothesis.is_further, []
-        if "moved" not in self.causes or self.hypothesis.mounting.any():
+        is_further = self.hypothesis.is_further
+        if "moved" not in self.causes or self.hypothesis.mounting.any() or not is_further.any():
             return []
-        for explanation in self.poses.candidates():
-            members = explanation.weights > 0
-            if explanation.cause == "moved" and 2 * is_further[members].sum() >= members.sum():
-                found.append(self.poses.gain(explanation))
+        moves = [m for m in self.poses.moves() if 2 * (m.weights @ is_further) >= m.weights.sum()]
+        found = [self.poses.gain(each) for each in moves]
         return sorted(found, key=lambda each: each.log10_chance)[:_N_REJECTED]
 
     def moves_beside(self, row: Gain) -> list[Gain]:
         """List the moves one capture before and after another one."""
         cuts = {row.explanation.cut - 1, row.explanation.cut + 1}
-        near = [e for e in self.poses.candidates() if e.cause == "moved" and e.cut in cuts]
-        return [self.poses.gain(each) for each in near]
+        return [self.poses.gain(each) for each in self.poses.moves() if each.cut in cuts]
 
     def _candidates(self) -> Iterator[Explanation]:
         layout, F = self.hypothesis.state.layout, len(self.cost.gradients)
@@ -409,7 +412,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         rows, late = table.rows(), table.moves_of_rejected()
         if not rows or (rows[0].log10_chance > _TRIED and not late):
             return
-        noisy = hypothesis.with_fitted_noise()
+        noisy = hypothesis.with_fitted_noise
         tried = [*Table(noisy, left).rows()[:1], rows[0], *late]
         # Causes that are alike at usual noise: settled, one may be much more probable than the other.
         alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
@@ -447,10 +450,12 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
         return Selected(row._replace(log10_chance=chance), change, now)
     else:
         after, change = _split(now, row)
-    left = after.with_fitted_noise()
+    left = after.with_fitted_noise
     fall = noisy.deviance - left.deviance
     chance = log10_chance(fall, row.freedoms) + np.log10(row.explanation.n_tried)
-    if not np.isfinite(fall) or left.largest_noise > (_MOVING if row.cause in MOUNTINGS else SCATTER):
+    if not np.isfinite(fall) or left.levels.largest_of_images > (
+        _MOVING if row.cause in MOUNTINGS else SCATTER
+    ):
         chance = 0.0
     if row.cause in ("moved", "groups") and not _agree(after, row.explanation.weights > 0):
         chance = 0.0

@@ -68,7 +68,7 @@ _CAUSES = {
 _CONTRADICTIONS = {
     "channels": "the camera's channels",
     "moved": "two mountings",
-    "drifted": "the mounting at the beginning and at the end",
+    "drift": "the mounting at the beginning and at the end",
     "scale": "the camera's distances and the LiDAR's",
     "range_offset": "the LiDAR's ranges and the boards",
     "range_scale": "the LiDAR's ranges and the boards",
@@ -118,17 +118,7 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     if cause is not None:
         worst_of = worst([cause, *(f for f in placed if f.follows == cause.code)])
         placed = [replace(cause, severity=worst_of, follows=""), *placed]
-    return tuple(
-        sorted(
-            placed,
-            key=lambda f: (
-                f.severity == "note",
-                bool(f.follows),
-                f.severity != "error",
-                f.code != (cause.code if cause else ""),
-            ),
-        )
-    )
+    return tuple(sorted(placed, key=lambda f: (f.severity == "note", bool(f.follows), f.severity != "error")))
 
 
 def is_symptom_alone(findings: Sequence[Finding]) -> bool:

@@ -81,21 +81,13 @@ class Hypothesis:
     @cached_property
     def deviance(self) -> float:
         """-2 ln p(captures, levels of the images) at the optimum, up to a constant."""
-        off = [np.log(self.noise_ratio(name)) / LOG_SIGMA[name] for name in OF_IMAGES]
+        off = [np.log(self.levels.ratio(name)) / LOG_SIGMA[name] for name in OF_IMAGES]
         return self.reduced.minus_2_log_likelihood + float(np.sum(np.square(off)))
 
-    def noise_ratio(self, name: str) -> float:
-        """Return a level of the images' errors in units of the usual one."""
-        return float(getattr(self.levels, name) / getattr(Levels(), name))
-
-    @property
-    def largest_noise(self) -> float:
-        """The largest `noise_ratio` of the images' levels."""
-        return max(self.noise_ratio(name) for name in OF_IMAGES)
-
+    @cached_property
     def with_fitted_noise(self) -> "Hypothesis":
-        """Fit the levels of the images' errors at the present expansion point."""
-        usual = replace(self.levels, **{name: getattr(Levels(), name) for name in OF_IMAGES})
+        """The same with the levels of the images' errors fitted at the present expansion point."""
+        usual = self.levels.with_usual_images
         fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
         return replace(self, levels=fitted)
 
@@ -155,8 +147,7 @@ def at_full_weight(
     state = State(layout, T_cam_lidar[None], T_lidar_board, own_shift_m, z)
     trust = weigh_placements(group_poses(T_lidar_board), [images])
     terms = linearise(scans, [images], board, state, trust)
-    levels = replace(joint.levels, **{name: getattr(Levels(), name) for name in OF_IMAGES})
-    priors = replace(joint.priors, freedoms=np.inf)
+    levels, priors = joint.levels.with_usual_images, replace(joint.priors, freedoms=np.inf)
     for _ in range(_OWN_STEPS):
         own = -assemble(terms, levels, priors).own_steps[:, :, -1]
         terms = linearise(scans, [images], board, terms.state.moved(np.zeros(layout.z.size), own), trust)

@@ -46,6 +46,20 @@ class Levels:
         edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
         return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
 
+    def ratio(self, name: str) -> float:
+        """Return a level in units of the usual one."""
+        return float(getattr(self, name) / getattr(Levels(), name))
+
+    @property
+    def largest_of_images(self) -> float:
+        """The largest `ratio` of the images' levels."""
+        return max(self.ratio(name) for name in OF_IMAGES)
+
+    @property
+    def with_usual_images(self) -> "Levels":
+        """Set the images' levels to the usual ones."""
+        return replace(self, **{name: getattr(Levels(), name) for name in OF_IMAGES})
+
 
 LOG_SIGMA: Mapping[str, float] = {
     "range_m": 0.7,
