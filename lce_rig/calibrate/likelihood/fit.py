@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
-from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, evidence, linearise
+from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
@@ -320,8 +320,10 @@ def fit_levels(
     def levels_at(x: Array) -> Levels:
         return replace(usual, **dict(zip(names, np.exp(x / scale).tolist(), strict=True)))
 
+    evidence = Evidence.of(terms, usual, priors, names)
+
     def cost(x: Array) -> tuple[float, Array]:
-        value, slopes = evidence(terms, levels_at(x), priors, names)
+        value, slopes = evidence(levels_at(x))
         off = (x / scale - middle) / sigma
         return value + float(off @ off), (slopes + 2 * off / sigma) / scale
 

@@ -99,6 +99,18 @@ class Products(NamedTuple):
     log_volume: Array
 
 
+class Summed(NamedTuple):
+    """Products summed over all groups.
+
+    Attributes:
+        products: (F, n, n) of [y, z, residual], by the captures' weights.
+        log_volume: log determinant of the errors' covariances.
+    """
+
+    products: Array
+    log_volume: float
+
+
 Part = Callable[[Terms, Levels], Iterator[Products]]
 
 
@@ -220,41 +232,68 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
         levels: of their noise.
         priors: of the constants.
     """
-    return _reduce(terms, [each for part in _PARTS for each in part(terms, levels)], levels, priors)
+    summed = _sum(terms, [each for part in _PARTS for each in part(terms, levels)])
+    return _reduce(terms, summed, levels, priors)
 
 
-def evidence(terms: Terms, levels: Levels, priors: Priors, names: Sequence[str]) -> tuple[float, Array]:
-    """Compute -2 ln p(data | levels) and its derivative by the logarithms of some levels.
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """-2 ln p(data | levels) as a function of some levels, with its derivative by their logarithms.
 
     By a level, it is the mean of v^T dM v over all unknowns given the data, with M the products of
     [y, z, 1] and their priors, and the change of the covariances' log determinants. Only M is differentiated
     by differences.
+
+    Attributes:
+        terms: of F captures.
+        priors: of the constants.
+        names: of the levels that vary.
+        others: sum of the products that depend on other levels alone.
     """
-    parts = {part: list(part(terms, levels)) for part in _PARTS}
-    reduced = _reduce(terms, [each for part in parts.values() for each in part], levels, priors)
-    moments = reduced.second_moments(terms.trust)
-    weighted = moments * terms.trust[:, None, None]
-    prior, mean, prior_volume = _prior(terms, levels, priors)
-    # All captures have the same z; the mean of the square of its distance from that of the prior.
-    z = terms.state.z - mean
-    common = slice(OWN.size, -1)
-    shift = np.outer(z, moments[0, common, -1])
-    squares = moments[0, common, common] + np.outer(z, z) + shift + shift.T
-    part_of = {name: part for part, of_part in _PARTS.items() for name in of_part}
-    felt = {part: [weighted[_places(each)] for each in products] for part, products in parts.items()}
 
-    def change(name: str) -> float:
-        there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
-        if name == "laser_m":
-            moved_prior, _, log_volume = _prior(terms, there, priors)
-            return float(np.vdot(squares, moved_prior - prior)) + log_volume - prior_volume
-        part, total = part_of[name], 0.0
-        for own, here, moved in zip(felt[part], parts[part], part(terms, there), strict=True):
-            total += float(np.vdot(own, moved.products - here.products))
-            total += float(terms.trust[here.capture] @ (moved.log_volume - here.log_volume))
-        return total
+    terms: Terms
+    priors: Priors
+    names: Sequence[str]
+    others: Summed
 
-    return reduced.minus_2_log_evidence, np.array([change(name) for name in names]) / _LOG_STEP
+    @classmethod
+    def of(cls, terms: Terms, levels: Levels, priors: Priors, names: Sequence[str]) -> "Evidence":
+        """Sum the products that depend on none of the levels named, at their present values."""
+        fixed = [part for part, of_part in _PARTS.items() if not set(of_part) & set(names)]
+        others = _sum(terms, [each for part in fixed for each in part(terms, levels)])
+        return cls(terms, priors, names, others)
+
+    def __call__(self, levels: Levels) -> tuple[float, Array]:
+        """Compute the value at these levels, and its derivatives."""
+        terms, priors = self.terms, self.priors
+        part_of = {name: part for part, of_part in _PARTS.items() for name in of_part if name in self.names}
+        parts = {part: list(part(terms, levels)) for part in _PARTS if part in part_of.values()}
+        varying = _sum(terms, [each for products in parts.values() for each in products])
+        summed = Summed(self.others.products + varying.products, self.others.log_volume + varying.log_volume)
+        reduced = _reduce(terms, summed, levels, priors)
+        moments = reduced.second_moments(terms.trust)
+        weighted = moments * terms.trust[:, None, None]
+        prior, mean, prior_volume = _prior(terms, levels, priors)
+        # All captures have the same z; the mean of the square of its distance from that of the prior.
+        z = terms.state.z - mean
+        common = slice(OWN.size, -1)
+        shift = np.outer(z, moments[0, common, -1])
+        squares = moments[0, common, common] + np.outer(z, z) + shift + shift.T
+        felt = {part: [weighted[_places(each)] for each in products] for part, products in parts.items()}
+
+        def change(name: str) -> float:
+            there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
+            if name == "laser_m":
+                moved_prior, _, log_volume = _prior(terms, there, priors)
+                return float(np.vdot(squares, moved_prior - prior)) + log_volume - prior_volume
+            part, total = part_of[name], 0.0
+            for own, here, moved in zip(felt[part], parts[part], part(terms, there), strict=True):
+                total += float(np.vdot(own, moved.products - here.products))
+                total += float(terms.trust[here.capture] @ (moved.log_volume - here.log_volume))
+            return total
+
+        slopes = np.array([change(name) for name in self.names]) / _LOG_STEP
+        return reduced.minus_2_log_evidence, slopes
 
 
 def _places(part: Products) -> tuple[Indices, Indices, Indices]:
@@ -262,8 +301,8 @@ def _places(part: Products) -> tuple[Indices, Indices, Indices]:
     return part.capture[:, None, None], part.place[:, :, None], part.place[:, None, :]
 
 
-def _reduce(terms: Terms, parts: Sequence[Products], levels: Levels, priors: Priors) -> Reduced:
-    """Sum the products of all parts, eliminate the captures' own unknowns and add the priors."""
+def _sum(terms: Terms, parts: Sequence[Products]) -> Summed:
+    """Sum the products of some parts."""
     trust, size = terms.trust, terms.state.layout.row.size
     shape, log_volume = (len(trust), size, size), 0.0
     M = np.zeros(len(trust) * size**2)
@@ -271,7 +310,12 @@ def _reduce(terms: Terms, parts: Sequence[Products], levels: Levels, priors: Pri
         at = np.ravel_multi_index(_places(part), shape)
         M += np.bincount(at.ravel(), part.products.ravel(), len(M))
         log_volume += float(trust[part.capture] @ part.log_volume)
-    M = M.reshape(shape) * trust[:, None, None]
+    return Summed(M.reshape(shape) * trust[:, None, None], log_volume)
+
+
+def _reduce(terms: Terms, summed: Summed, levels: Levels, priors: Priors) -> Reduced:
+    """Eliminate the captures' own unknowns and add the priors."""
+    (M, log_volume), trust = summed, terms.trust
     own, common = slice(0, OWN.size), slice(OWN.size, None)
     of_own, cross = M[:, own, own], M[:, own, common]
     steps = np.linalg.solve(of_own, cross)
@@ -279,13 +323,13 @@ def _reduce(terms: Terms, parts: Sequence[Products], levels: Levels, priors: Pri
     prior, mean, prior_volume = _prior(terms, levels, priors)
     off = terms.state.z - mean
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
-    summed = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
-    information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
-    least = costs.sum() + off @ summed.prior_gradient
+    cost = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
+    information, gradient = cost.information, gradients.sum(axis=0) + cost.prior_gradient
+    least = costs.sum() + off @ cost.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
     likelihood = float(least + log_volume)
     log_volume += float(trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
-    return Reduced(summed, np.asarray(steps), of_own, float(least + log_volume + prior_volume), likelihood)
+    return Reduced(cost, np.asarray(steps), of_own, float(least + log_volume + prior_volume), likelihood)
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:

@@ -11,7 +11,7 @@ from lce_rig.calibrate.likelihood.images import image_rows, stack_images
 from lce_rig.calibrate.likelihood.layout import BOARD as PRINT
 from lce_rig.calibrate.likelihood.layout import END, RING, SHIFTS, State, image_columns
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
-from lce_rig.calibrate.likelihood.model import assemble, evidence, linearise
+from lce_rig.calibrate.likelihood.model import Evidence, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import (
     edge_rows,
     lens_fields,
@@ -264,7 +264,7 @@ def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, imag
     trust = np.linspace(0.4, 1.0, scans.n_captures)
     terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board), trust)
     priors, base, step = Priors(), Levels(), 1e-3
-    value, slopes = evidence(terms, base, priors, list(LOG_SIGMA))
+    value, slopes = Evidence.of(terms, base, priors, list(LOG_SIGMA))(base)
     assert value == assemble(terms, base, priors).minus_2_log_evidence
     for name, slope in zip(LOG_SIGMA, slopes, strict=True):
         below, above = (
