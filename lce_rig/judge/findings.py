@@ -123,8 +123,9 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def is_symptom_alone(findings: Sequence[Finding]) -> bool:
     """Check whether all reasons are symptoms without a cause."""
+    follow = _SYMPTOMS | (_PLATES if any(f.code in _OF_SIZES for f in findings) else frozenset())
     codes = [f.code for f in findings if f.severity != "note" and f.code not in _UNCERTAIN]
-    return bool(codes) and all(code in _SYMPTOMS for code in codes)
+    return bool(codes) and all(code in follow for code in codes)
 
 
 def causes_of(findings: Sequence[Finding]) -> list[Finding]:
