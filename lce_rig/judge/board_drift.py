@@ -28,8 +28,9 @@ from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, PoseDifference, difference, tangent_sizes
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.detect.detection import Detections, Pair
+from lce_rig.judge.reach import JointDifference
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import IS_ROTATION
@@ -42,19 +43,11 @@ _BIAS = np.repeat([0.005, np.radians(0.1)], 3)
 _MIN_PLACEMENTS = 3  # Fewer do not determine the scatter.
 # Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
 _CHANGED_CHI2 = 22.46
-# Smallest change along an eigen-direction that counts as a part of a joint change, standard deviations.
-_NAMED_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class JointDrift(PoseDifference):
-    """The change of all six axes together; its covariance includes the deployed extrinsics' own.
-
-    Attributes:
-        lever_m: rms distance of the boards, which makes angles comparable with distances.
-    """
-
-    lever_m: float
+class JointDrift(JointDifference):
+    """The change of all six axes together; its covariance includes the deployed extrinsics' own."""
 
     @property
     def is_changed(self) -> bool:
@@ -63,24 +56,8 @@ class JointDrift(PoseDifference):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes with more than an even share of the significant part; empty if unchanged."""
-        if not self.is_changed:
-            return ()
-        shares = (self._scale * self.significant) ** 2
-        return tuple(np.array(MOTIONS)[shares > shares.mean()].tolist())
-
-    @property
-    def significant(self) -> Array:
-        """The part (6,) of the change along eigen-directions of the covariance in which it is significant.
-
-        Boards at one distance do not separate pitch from height: a change of either appears along the
-        direction of both.
-        """
-        variances, directions = self._directions
-        along = (self._scale * self.tangent) @ directions
-        # At least the most significant one.
-        least = min(_NAMED_SIGMAS**2, float(np.max(along**2 / variances)))
-        return np.asarray(directions @ np.where(along**2 >= least * variances, along, 0.0) / self._scale)
+        """Names of the axes that changed; empty if unchanged."""
+        return self.main_axes if self.is_changed else ()
 
     @property
     def finding(self) -> Finding:
@@ -96,27 +73,16 @@ class JointDrift(PoseDifference):
     @property
     def hidden(self) -> Finding:
         """The largest change that the boards would not show, along their least determined direction."""
-        variances, directions = self._directions
+        variances, directions = self.directions
         # A shift of the mean by this much exceeds the threshold in about 95 % of trials.
         size = np.sqrt(_CHANGED_CHI2) + POWER_SIGMAS
         least_known = directions[:, -1]
-        rotation_deg, translation_m = tangent_sizes(size * np.sqrt(variances[-1]) * least_known / self._scale)
+        rotation_deg, translation_m = tangent_sizes(size * np.sqrt(variances[-1]) * least_known / self.scale)
         weights = np.abs(least_known)
         turn, shift = MOTIONS[3 + int(np.argmax(weights[3:]))], MOTIONS[int(np.argmax(weights[:3]))]
         return BOARD_HIDES(
             rotation_deg=rotation_deg, translation_m=translation_m, rotation=turn, translation=shift
         )
-
-    @property
-    def _scale(self) -> Array:
-        """(6,) displacement of the boards, m, per unit of each axis."""
-        return np.asarray(np.r_[np.ones(3), np.full(3, self.lever_m)])
-
-    @property
-    def _directions(self) -> tuple[Array, Array]:
-        """Variances (6,) of the covariance, m^2, from the smallest; eigen-directions (6, 6) in columns."""
-        variances, directions = np.linalg.eigh(self.cov * np.outer(self._scale, self._scale))
-        return variances, directions
 
 
 @dataclass(frozen=True, eq=False)

@@ -534,7 +534,8 @@ REPEAT_AGREE = Kind("repeat.agree", _agree, severity="note")
 REPEAT_DISAGREE = Kind(
     "repeat.disagree",
     "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
-    "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
+    "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as "
+    "much as predicted, most in {axes:motion}",
     "do not use any of them until the cause is known",
     actions={
         "odd_one": "find the fault in {odd_one}, without it the others agree",

@@ -6,18 +6,62 @@ correlated: a principal point that is off turns the extrinsics, which leaves pix
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.core.calibration import Calibration, PointUncertainty
+from lce_rig.core.calibration import MOTIONS, Calibration, PointUncertainty
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, perturb, skew
+from lce_rig.core.geometry import Array, PoseDifference, perturb, skew
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import LensModel, model_of
 
 DISTANCES_M = (5.0, 10.0, 20.0)
+# Smallest part along an eigen-direction that is named, standard deviations.
+_NAMED_SIGMAS = 2.0
 # Beyond some radius the distortion is undefined; corners are moved to that radius.
 _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class JointDifference(PoseDifference):
+    """The difference of two extrinsics with its covariance, along the eigen-directions of that.
+
+    Attributes:
+        lever_m: rms distance of the boards, which makes angles comparable with distances.
+    """
+
+    lever_m: float
+
+    @property
+    def significant(self) -> Array:
+        """The part (6,) of the difference along eigen-directions in which it is significant.
+
+        Boards at one distance do not separate pitch from height: a change of either appears along the
+        direction of both.
+        """
+        variances, directions = self.directions
+        along = (self.scale * self.tangent) @ directions
+        # At least the most significant one.
+        least = min(_NAMED_SIGMAS**2, float(np.max(along**2 / variances)))
+        return np.asarray(directions @ np.where(along**2 >= least * variances, along, 0.0) / self.scale)
+
+    @property
+    def main_axes(self) -> tuple[str, ...]:
+        """Names of the axes with more than an even share of the significant part."""
+        shares = (self.scale * self.significant) ** 2
+        return tuple(np.array(MOTIONS)[shares > shares.mean()].tolist())
+
+    @property
+    def scale(self) -> Array:
+        """(6,) displacement of the boards, m, per unit of each axis."""
+        return np.asarray(np.r_[np.ones(3), np.full(3, self.lever_m)])
+
+    @property
+    def directions(self) -> tuple[Array, Array]:
+        """Variances (6,) of the covariance, m^2, from the smallest; eigen-directions (6, 6) in columns."""
+        variances, directions = np.linalg.eigh(self.cov * np.outer(self.scale, self.scale))
+        return variances, directions
 
 
 def covariance_alone(calibration: Calibration) -> Array:

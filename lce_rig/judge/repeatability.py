@@ -11,7 +11,6 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import (
     Array,
-    PoseDifference,
     chance_of,
     difference,
     invert,
@@ -19,12 +18,14 @@ from lce_rig.core.geometry import (
     tangent_sizes,
 )
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE
-from lce_rig.judge.reach import as_used, covariance_alone
+from lce_rig.judge.reach import JointDifference, as_used, covariance_alone
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
 # If correct ones spread farther with more than this probability, reported uncertainties are conservative.
 _GENEROUS = 0.95
+# Distance of boards that is assumed where results do not state it, m.
+_LEVER_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class PairDifference:
         p: probability that correct calibrations differ this much or more.
         displacements_m: by distance from the camera, both m: how far apart they place a point in the middle
             of the image, where boards were near and far; empty where their distances are not known.
+        axes: those of the most significant part of the difference.
     """
 
     first: str
@@ -48,6 +50,7 @@ class PairDifference:
     distance: float
     p: float
     displacements_m: Mapping[float, float]
+    axes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ class Repeatability:
             return REPEAT_AGREE(is_generous=self.p > _GENEROUS, **figures)
         action = "overlays" if not self.are_independent else "" if self.odd_one is None else "odd_one"
         worst = min(self.differences, key=lambda pair: pair.p)
-        figures |= {"first": worst.first, "second": worst.second}
+        figures |= {"first": worst.first, "second": worst.second, "axes": worst.axes}
         return REPEAT_DISAGREE(action=action, ratio=self.ratio, odd_one=self.odd_one, **figures)
 
 
@@ -159,10 +162,13 @@ def compare_calibrations(
     factor = 1.0 if are_independent else 2.0
     differences = []
     for i, j in pairs:
-        apart = PoseDifference(difference(T[i], T[j]), factor * (cov[i] + cov[j]))
         apart_m = _displacements(calibrations[names[i]], calibrations[names[j]])
+        lever_m = float(np.mean(list(apart_m))) if apart_m else _LEVER_M
+        apart = JointDifference(difference(T[i], T[j]), factor * (cov[i] + cov[j]), lever_m)
         distance, sizes = float(np.sqrt(apart.chi2)), tangent_sizes(apart.tangent)
-        differences.append(PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart_m))
+        differences.append(
+            PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart_m, apart.main_axes)
+        )
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
         p = chance_of(chi2, dof)
