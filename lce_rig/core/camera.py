@@ -66,8 +66,8 @@ class Intrinsics:
             )
         fx, _, cx, _, fy, cy, *_ = (float(value) for value in np.asarray(K, dtype=np.float64).ravel())
         if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
-            what = "" if np.any(K) else "it is uncalibrated: "
-            raise ValueError(f"{what}its camera matrix is not measured (fx {fx:g}, fy {fy:g})")
+            what = "K is not a camera matrix" if np.any(K) else "uncalibrated, K is all zero"
+            raise ValueError(f"{what} (fx {fx:g}, fy {fy:g})")
         return cls(fx, fy, cx, cy, *size_px, model=family, distortion=coefficients)
 
     @cached_property

@@ -92,20 +92,18 @@ class CameraDescription:
         K, distortion, model, notes = self.K, self.distortion, self.model, list[str]()
         if is_rectified and self.P.any():
             K, distortion, model = self.P[:, :3], (), ""
-            notes.append("rectified images: P is used, without distortion")
+            notes.append("its P without distortion, as the images are rectified")
         elif is_rectified and any(distortion):
-            raise ValueError("its P is all zero, and the images are rectified")
+            raise ValueError("P is all zero, and the images are rectified")
         lens = Intrinsics.from_ros(model, K, distortion, self.size_px)
         offset_px, binning, size_px = self._readout(image_px)
         if self.size_px == (0, 0):
-            notes.append(f"states 0x0 px: {size_px[0]}x{size_px[1]} px of the images are used")
-        if any(offset_px) or binning != (1, 1):
-            notes.append(
-                f"binning {binning[0]}x{binning[1]} and offset {offset_px[0]}, {offset_px[1]} px are applied"
-            )
-        elif self._is_windowed:
-            notes.append("binning and roi are not applied: the images have the full size")
+            notes.append(f"it states 0x0 px, {size_px[0]}x{size_px[1]} px are the images'")
         (x, y), (across, down) = offset_px, binning
+        notes += [f"binning {across}x{down} applied"] if binning != (1, 1) else []
+        notes += [f"roi at {x}, {y} px applied"] if any(offset_px) else []
+        if self._is_windowed and not any(offset_px) and binning == (1, 1):
+            notes.append("its binning and roi are not those of the images, which have the full size")
         read = replace(
             lens,
             fx_px=lens.fx_px / across,
@@ -265,7 +263,7 @@ def _documents(data: bytes) -> Iterator[Any]:
         import yaml
 
         # OpenCV's directive and tags are no YAML; what they mark reads as plain mappings.
-        text = re.sub(r"^%YAML.*\n", "", text).replace("!!opencv-matrix", "")
+        text = re.sub(r"^%YAML.*\n|!!opencv-[a-z-]+", "", text)
         yield from yaml.safe_load_all(text)
 
 

@@ -125,7 +125,7 @@ def new_profile(
         if len(intrinsics) != len(groups):
             raise UsageError(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
-                f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.\n"
+                f"Give --intrinsics once for each --camera: a file of a camera, or {_LENS_FORM}.\n"
                 f"{_rough_lens(folder_px)}",
             )
     model = lidar_model or _UNKNOWN_MODEL
@@ -299,7 +299,7 @@ def parse_intrinsics(text: str) -> Intrinsics | CameraFile:
     except ValueError:
         models = ", ".join(_FAMILIES)
         raise UsageError(
-            f"--intrinsics {text}: neither a camera_info file nor intrinsics",
+            f"--intrinsics {text}: neither a file of a camera nor intrinsics",
             f"Give {_LENS_FORM}; models: {models}.",
         ) from None
     width, height = map(int, size.groups())
@@ -348,7 +348,7 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
     why = next((each.note for each in group if each.note), f"no camera_info beside {topic.topic}")
     raise UsageError(
         f"no intrinsics of camera {camera} ({topic.topic}): {why}",
-        f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.\n"
+        f"Give --intrinsics for every camera: a file of a camera, or {_LENS_FORM}.\n"
         f"{_rough_lens(topic.size_px)}",
     )
 
