@@ -39,6 +39,9 @@ _COEFFICIENTS = (
     *("d", "distortion", "dist"),
 )
 _PROJECTION = ("projectionmatrix", "p")
+_RECTIFICATION = ("rectificationmatrix", "r")
+# Smaller angles are below what a calibration can tell.
+_TURNED_DEG = 0.005
 _SIZE = ("imagesize", "resolution", "imgsize", "size")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "camwidth"), ("imageheight", "height", "camheight")
 _MODEL = ("distortionmodel", "distmodel", "cammodel", "cameramodel", "modeltype", "model", "lensmodel")
@@ -60,6 +63,7 @@ class CameraDescription:
         model: name of the distortion model, as `Intrinsics.from_ros` takes it.
         size_px: (width, height) to which K belongs; zeros where it is not stated.
         P: (3, 4) px, of rectified images; zeros where it is not stated.
+        turned_deg: angle by which rectification turns the camera's frame.
         binning: pixels of the sensor per pixel of the images, in x and y.
         roi_px: (x offset, y offset, width, height) that is read out, at the full size; a width and height of
             zero for all of it.
@@ -72,6 +76,7 @@ class CameraDescription:
     model: str
     size_px: tuple[int, int]
     P: Array = field(default_factory=lambda: np.zeros((3, 4)))
+    turned_deg: float = 0.0
     binning: tuple[int, int] = (1, 1)
     roi_px: tuple[int, int, int, int] = (0, 0, 0, 0)
     name: str = ""
@@ -93,6 +98,10 @@ class CameraDescription:
         if is_rectified and self.P.any():
             K, distortion, model = self.P[:, :3], (), ""
             notes.append("its P without distortion, as the images are rectified")
+            if self.turned_deg > _TURNED_DEG:
+                notes.append(
+                    f"optical_frame is that of the rectified images, {self.turned_deg:.2g} deg away (R)"
+                )
         elif is_rectified and any(distortion):
             raise ValueError("P is all zero, and the images are rectified")
         lens = Intrinsics.from_ros(model, K, distortion, self.size_px)
@@ -178,10 +187,10 @@ def describe_message(info: Any) -> CameraDescription:
     Raises:
         ValueError: a field is not as it has to be.
     """
-    names = ("distortion_model", "width", "height", "binning_x", "binning_y", "k", "d", "p")
+    names = ("distortion_model", "width", "height", "binning_x", "binning_y", "k", "d", "p", "r")
     fields = {name: getattr(info, name, None) for name in names}
     # ROS 1 has capital letters.
-    fields |= {name: getattr(info, name.upper()) for name in "kdp" if hasattr(info, name.upper())}
+    fields |= {name: getattr(info, name.upper()) for name in "kdpr" if hasattr(info, name.upper())}
     roi = {name: getattr(info.roi, name) for name in ("x_offset", "y_offset", "width", "height")}
     return next(_describe({**fields, "roi": roi}))
 
@@ -294,7 +303,12 @@ def _parse_ini(text: str) -> dict[str, Any]:
         what = "it has 4 coefficients and names no model"
         raise ValueError(f"{what}: give the ost.yaml beside it, which says plumb_bob or equidistant")
     flat = {key: numbers[0] if len(numbers) == 1 else numbers for key, numbers in values.items()}
-    return {**flat, "projection matrix": flat.get("projection"), "camera_name": camera}
+    return {
+        **flat,
+        "projection matrix": flat.get("projection"),
+        "r": flat.get("rectification"),
+        "camera_name": camera,
+    }
 
 
 def _describe(data: Any, name: str = "", depth: int = 0) -> Iterator[CameraDescription]:
@@ -331,11 +345,10 @@ def _camera_matrix(flat: Mapping[str, Any], side: str) -> Array | None:
         return None
     # FAST-LIVO2, then Kalibr.
     values = _numbers([flat.get(f"cam{key}") for key in ("fx", "fy", "cx", "cy")])
-    if "resolution" in flat:
-        values = _numbers(flat.get("intrinsics"))
-        projection = flat.get("cameramodel", "pinhole")
-        if values is not None and (projection != "pinhole" or len(values) != 4):
-            what = f"camera_model {projection!r} with {len(values)} intrinsics cannot be used"
+    if "intrinsics" in flat:
+        values = _numbers(flat["intrinsics"])
+        if values is not None and len(values) != 4:
+            what = f"camera_model {flat.get('cameramodel')!r} with {len(values)} intrinsics cannot be used"
             raise ValueError(f"{what}: calibrate it as pinhole with radtan or equidistant")
     if values is None or not np.isfinite(values).all():
         return None
@@ -354,6 +367,8 @@ def _one_camera(flat: Mapping[str, Any], K: Array, side: str, name: str) -> Came
         singles = (flat.get(key) for key in chain(*((f"camd{k}", f"k{k + 1}") for k in range(5))))
         coefficients = [float(value) for value in singles if isinstance(value, int | float)]
     P = _first_numbers(flat, _PROJECTION) or []
+    turn = _first_numbers(flat, _RECTIFICATION) or []
+    R = np.reshape(turn, (3, 3)) if len(turn) == 9 and any(turn) else np.eye(3)
     size = _first_numbers(flat, _SIZE) or [_number(flat, keys) for keys in (_WIDTH, _HEIGHT)]
     roi = flat.get("roi")
     roi = roi if isinstance(roi, Mapping) else {}
@@ -364,6 +379,7 @@ def _one_camera(flat: Mapping[str, Any], K: Array, side: str, name: str) -> Came
         _model_name(flat),
         (int(size[0]), int(size[1])),
         np.reshape(P, (3, 4)) if len(P) == 12 else np.zeros((3, 4)),
+        float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))),
         (binning[0], binning[1]),
         (
             int(roi.get("x_offset") or 0),

@@ -82,6 +82,7 @@ def chain(*topics, **more):
         (chain("/cam/image_raw"), 4),
         (livo2(), 4),
         ({"/**": {"ros__parameters": livo2()}}, 4),
+        (info_file() | {"camera_matrix": K.tolist(), "D": list(D)}, 5),
     ],
 )
 def test_camera_file_each_form_gives_the_lens(tmp_path, content, n):
@@ -160,6 +161,13 @@ def test_rectified_takes_the_projection_matrix(tmp_path):
         described(P=np.zeros((3, 4))).intrinsics(SIZE, is_rectified=True)
     from_file, _ = read_cameras(write(tmp_path, ost())).intrinsics("cam", ["/cam/image_rect"], SIZE)
     assert from_file == lens
+
+
+def test_rectified_by_a_turn_names_the_frame(tmp_path):
+    R, _ = cv2.Rodrigues(np.radians([0.0, 0.8, 0.0]))
+    path = write(tmp_path, echo(r=R.ravel().tolist()))
+    _, notes = read_cameras(path).intrinsics("cam", ["/cam/image_rect"], SIZE)
+    assert "0.8 deg away" in notes[1]
 
 
 @pytest.mark.parametrize(
