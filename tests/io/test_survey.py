@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.io.ros.topics import survey_bag
@@ -90,6 +92,19 @@ def test_survey_undecodable_topics_are_listed(tmp_path, write_bag, room, cloud_m
     path = write_bag(tmp_path / "bag", "mcap", sent)
     _, notes = new_profile("truck", parse_board("5x7,0.095,0.61x0.85"), recording=path, intrinsics=[LENS])
     assert any("/rear/image_raw: skipped, its encoding '32fc1' is not known" in note for note in notes)
+
+
+def test_survey_video_topics_are_listed(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "foxglove_msgs/msg/CompressedVideo"
+    store.register(get_types_from_msg("uint8[] data", name))
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/front/video", name, typestore=store)
+        message = store.types[name](np.zeros(8, np.uint8))
+        writer.write(connection, 10**18, store.serialize_cdr(message, name))
+    with pytest.raises(SourceError) as caught:
+        survey_bag(tmp_path / "bag")
+    assert "/front/video: skipped, foxglove_msgs/CompressedVideo is not read" in caught.value.hint
 
 
 LENS = parse_intrinsics("radtan,64x48,50,50,32,24")

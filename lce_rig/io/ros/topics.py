@@ -1,5 +1,6 @@
 """A bag's topics: their assignment to the sensors of a rig, and a survey of them for a new profile."""
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -29,6 +30,8 @@ CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES
 PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 _INFO = "sensor_msgs/CameraInfo"
+# Messages of video, as theora_image_transport/Packet and foxglove_msgs/CompressedVideo.
+_VIDEO = re.compile(r"image_transport\w*/|CompressedVideo$")
 # Drivers start within this many messages of each other.
 _N_PROBED = 5000
 Topics: TypeAlias = Mapping[str, tuple[str, int]]
@@ -239,6 +242,15 @@ def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic
         if not first:
             raise
     sensors, skipped = [], [] if skipped is None else skipped
+    skipped += [
+        f"{topic}: skipped, {kind} is not read: record raw or compressed images"
+        for topic, kind in types.items()
+        if _VIDEO.search(kind)
+    ]
+    skipped += [
+        f"{topic}: skipped, it has none of the first {_N_PROBED} messages"
+        for topic in sorted(wanted - first.keys())
+    ]
     for topic in sorted(wanted & first.keys()):
         message, n = first[topic], bag.topics[topic][1]
         try:
