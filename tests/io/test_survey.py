@@ -124,12 +124,13 @@ def test_survey_each_image_has_its_own_camera_info(tmp_path, write_bag, image_me
                 "/s/left_camera_info",
                 "/s/right_camera_info",
                 "/t/x_camera_info",
+                "/r/camera_info",
             )
         )
     }
     images = (
         "/a/image_raw",
-        "/a/image_rect_color",
+        "/r/image_rect_color",
         "/a/image_x",
         "/s/left_image",
         "/s/right_image",
@@ -140,7 +141,7 @@ def test_survey_each_image_has_its_own_camera_info(tmp_path, write_bag, image_me
     found = {topic.topic: topic for topic in survey_bag(write_bag(tmp_path / "bag", kind, sent))}
     focal = {name: topic.intrinsics and topic.intrinsics.fx_px for name, topic in found.items()}
     assert focal == dict(zip(images, (50, 45, 51, 52, 53, None), strict=True))
-    rectified = found["/a/image_rect_color"]
+    rectified = found["/r/image_rect_color"]
     assert rectified.intrinsics.distortion == () and "P without distortion" in rectified.note
 
 
@@ -160,3 +161,13 @@ def test_survey_camera_info_notes_name_its_topic(tmp_path, write_bag, image_mess
     sent += [("/a/image", "Image", t, image_message(np.zeros((48, 64), np.uint8), t, "mono8"))]
     (found,) = survey_bag(write_bag(tmp_path / "bag", "ros1", sent))
     assert found.note.startswith("/a/camera_info: ") and told in found.note
+
+
+def test_survey_computed_images_are_no_second_camera(tmp_path, write_bag, image_message):
+    pixels, t = np.zeros((48, 64, 3), np.uint8), 10**18
+    names = ("/a/image_raw", "/a/image_rect_color", "/a/image_mono", "/b/image_rect")
+    sent = [(name, "Image", t, image_message(pixels, t)) for name in names]
+    skipped = []
+    found = survey_bag(write_bag(tmp_path / "bag", "ros1", sent), skipped)
+    assert [topic.topic for topic in found] == ["/a/image_raw", "/b/image_rect"]
+    assert skipped[1] == "/a/image_rect_color: skipped, it is computed from /a/image_raw"

@@ -30,6 +30,8 @@ CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES
 PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 _INFO = "sensor_msgs/CameraInfo"
+# Images that image_proc computes from image_raw: as a second camera they would count twice.
+_COMPUTED = frozenset({"image_mono", "image_color", "image_rect", "image_rect_color"})
 # Messages of video, as theora_image_transport/Packet and foxglove_msgs/CompressedVideo.
 _VIDEO = re.compile(r"image_transport\w*/|CompressedVideo$")
 # Drivers start within this many messages of each other.
@@ -268,7 +270,7 @@ def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic
         raise SourceError(
             f"{path}: no images, events or point clouds", "\n".join([*skipped, list_topics(bag.topics)])
         )
-    return sensors
+    return _without_computed(sensors, skipped)
 
 
 def _probe(message: RawMessage, n: int) -> SensorTopic:
@@ -296,6 +298,19 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
         if name in (cloud.dtype.names or ()) and len(cloud):
             n_rings = len(np.unique(cloud[name]))
     return SensorTopic(message.topic, "scans", n, frame=frame, n_rings=n_rings, cloud=cloud)
+
+
+def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[SensorTopic]:
+    """Leave out images that are computed from raw ones beside them; `skipped` receives them."""
+    raw = {sensor.namespace: sensor.topic for sensor in sensors if sensor.image_topic.endswith("/image_raw")}
+    kept = []
+    for sensor in sensors:
+        is_computed = sensor.image_topic.rpartition("/")[2] in _COMPUTED
+        if is_computed and sensor.namespace in raw:
+            skipped.append(f"{sensor.topic}: skipped, it is computed from {raw[sensor.namespace]}")
+        else:
+            kept.append(sensor)
+    return kept
 
 
 def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
