@@ -53,7 +53,7 @@ _MODELS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraDescription:
     """A camera as described.
 
@@ -195,7 +195,7 @@ def describe_message(info: Any) -> CameraDescription:
     return next(_describe({**fields, "roi": roi}))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraFile:
     """The cameras that a file describes.
 
