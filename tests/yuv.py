@@ -18,3 +18,10 @@ def to_422(bgr, order):
     chroma = u.copy()
     chroma[:, 1::2] = v[:, ::2]
     return np.stack((chroma, y) if order == "uyvy" else (y, chroma), axis=-1)
+
+
+def to_420(bgr, order):
+    """Convert (H, W, 3) BGR to (H * 3 / 2, W), "nv12" or "nv21", each four pixels with one chroma."""
+    y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
+    chroma = np.stack((u, v) if order == "nv12" else (v, u), axis=-1)[::2, ::2]
+    return np.concatenate([y, chroma.reshape(len(y) // 2, -1)])

@@ -16,6 +16,7 @@ from lce_rig.collect.gates import stillness_window_s
 from lce_rig.collect.live.guide import predict
 from lce_rig.collect.offline import collect as collect_into
 from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.detect.findings import LENS_MISFITS
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import SourceOptions
@@ -179,9 +180,15 @@ def collect(
         hint = (
             f"Hold the board still for {hold_s} s in view of both sensors, and check that their clocks agree."
         )
-        if [why.code for why, _ in report.counts.counts()] == [IMAGE_NONE.code]:
+        causes = {why.code for why, _ in report.counts.counts()}
+        if causes == {IMAGE_NONE.code}:
             hint = (
                 "Compare `board` in the profile with an image: count inner corners, or squares with markers."
+            )
+        elif causes and causes <= {IMAGE_NONE.code, *LENS_MISFITS}:
+            hint = (
+                "Correct the camera's `intrinsics` in the profile: those of the images as recorded "
+                "(rectified, binned, cropped), and flatten the board."
             )
         elif report.has_events:
             hint = "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."

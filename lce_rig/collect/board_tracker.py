@@ -12,6 +12,7 @@ from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.findings import BOARD_THERE
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
 from lce_rig.rig.profile import NominalExtrinsic
@@ -99,6 +100,7 @@ class BoardTracker:
     _n_candidates: dict[str, int] = field(default_factory=dict)
     _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
     _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
+    _unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
     _are_proved: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -149,10 +151,24 @@ class BoardTracker:
         if are_scans_enough or not lidars:
             for refusal in unscanned.values():
                 self.refusals.add(refusal)
+        for key in detection.images:
+            self._unseen.pop(key, None)
         if not detection.images and not are_scans_enough:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            self.refusals.add(IMAGE_NONE.refusal())
+            self.refusals.add(self._explain_none(detection))
         return replace(detection, lidars=lidars, unscanned=unscanned)
+
+    def _explain_none(self, detection: BoardDetection) -> Refusal:
+        """Return why no board of a frame is usable: the one that is there is refused, or there is none.
+
+        Frames between two searches of an image have the reason of the earlier one.
+        """
+        self._unseen |= detection.unseen
+        for image in detection.frame.images:
+            why = self._unseen.get((image.sensor, image.channel))
+            if why is not None and why.code in BOARD_THERE:
+                return why
+        return IMAGE_NONE.refusal()
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.

@@ -9,6 +9,16 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
+CUT_FRACTION = 0.02
+"""Share of an image's rows or columns that a readout may cut off at its end; more is another mode."""
+
+_FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
+    **dict.fromkeys(("", "none", "plumb_bob", "radtan", "rational_polynomial"), "radtan"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye"), "equidistant"),
+}
+# Lengths of OpenCV's radial-tangential vector beyond plumb_bob: rational, thin prism, tilted sensor.
+_LONG_RADTAN = (8, 12, 14)
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -38,29 +48,27 @@ class Intrinsics:
         """Take the fields of sensor_msgs/CameraInfo.
 
         Args:
-            model: plumb_bob, rational_polynomial, equidistant or fisheye; "" where nothing is distorted.
+            model: plumb_bob, rational_polynomial, equidistant, or Kalibr's and OpenCV's names of these; ""
+                where nothing is distorted.
             K: (3, 3) or (9,).
-            distortion: its coefficients.
+            distortion: its coefficients; zeros at the end that the model lacks are dropped.
             size_px: (width, height).
 
         Raises:
             ValueError: a model that cannot be used, another number of coefficients, or no camera matrix.
         """
-        names: dict[str, tuple[Literal["radtan", "equidistant"], tuple[int, ...]]] = {
-            "": ("radtan", (0,)),
-            "plumb_bob": ("radtan", (0, 4, 5)),
-            "rational_polynomial": ("radtan", (8,)),
-            "equidistant": ("equidistant", (4,)),
-            "fisheye": ("equidistant", (4,)),
-        }
-        if model not in names or len(distortion) not in names[model][1]:
-            known = ", ".join(f"{name} {n[-1]}" for name, (_, n) in names.items() if name)
-            raise ValueError(f"{model!r} with {len(distortion)} coefficients cannot be used ({known} can)")
+        family = _FAMILIES.get(model.lower())
+        coefficients = _shorten(model.lower(), tuple(float(value) for value in distortion))
+        if family is None or coefficients is None:
+            known = "plumb_bob (4, 5), rational_polynomial (8), equidistant (4); any more must be zero"
+            raise ValueError(
+                f"{model!r} with {len(distortion)} coefficients cannot be used: models are {known}"
+            )
         fx, _, cx, _, fy, cy, *_ = (float(value) for value in np.asarray(K, dtype=np.float64).ravel())
         if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
-            raise ValueError(f"its camera matrix is not measured (fx {fx:g}, fy {fy:g})")
-        coefficients = tuple(float(value) for value in distortion)
-        return cls(fx, fy, cx, cy, *size_px, model=names[model][0], distortion=coefficients)
+            what = "K is not a camera matrix" if np.any(K) else "uncalibrated, K is all zero"
+            raise ValueError(f"{what} (fx {fx:g}, fy {fy:g})")
+        return cls(fx, fy, cx, cy, *size_px, model=family, distortion=coefficients)
 
     @cached_property
     def matrix(self) -> Array:
@@ -243,3 +251,17 @@ class Intrinsics:
         inside = (u >= margin_px) & (u <= self.width_px - 1 - margin_px)
         inside &= (v >= margin_px) & (v <= self.height_px - 1 - margin_px)
         return np.asarray(inside)
+
+
+def _shorten(model: str, distortion: tuple[float, ...]) -> tuple[float, ...] | None:
+    """Drop zeros behind the coefficients of a model; None if no model here has as many coefficients."""
+    n, n_used = len(distortion), len(np.trim_zeros(np.array(distortion), "b"))
+    if model in ("", "none"):
+        return () if n_used == 0 else None
+    if _FAMILIES.get(model) == "equidistant":
+        return distortion[:4] if n_used <= 4 <= n else None
+    if n in (0, 4, 5):
+        return distortion
+    if n_used <= 5 < n:
+        return distortion[:5]
+    return distortion[:8] if n_used <= 8 and n in _LONG_RADTAN else None

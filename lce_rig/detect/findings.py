@@ -126,10 +126,22 @@ IMAGE_BLURRED = Kind(
     "hold the board still, expose shorter, come closer, focus the lens",
     actions={"events": MOVE_SLOWLY + "; come closer"},
 )
-IMAGE_NO_POSE = Kind("image.no_pose", "the corners fit no pose of the board in front of the camera", _LENS)
-IMAGE_MISFIT = Kind(
-    "image.misfit", "reprojection error of the corners {rms_px:.2f} px rms (limit {max_rms_px:.2f} px)", _LENS
+IMAGE_NO_POSE = Kind(
+    "image.no_pose", "the corners detected fit no pose of the board in front of the camera", _LENS
 )
+IMAGE_MISFIT = Kind(
+    "image.misfit",
+    "corners detected, the profile's intrinsics do not fit them: reprojection error {rms_px:.2f} px rms "
+    "(limit {max_rms_px:.2f} px)",
+    _LENS,
+)
+LENS_MISFITS = frozenset({IMAGE_NO_POSE.code, IMAGE_MISFIT.code})
+"""Codes of images whose corners are detected, and refused by the intrinsics."""
+BOARD_THERE = LENS_MISFITS | {
+    *(IMAGE_CUT_OFF.code, IMAGE_OTHER_BOARD.code, IMAGE_OTHER_DICTIONARY.code),
+    *(IMAGE_OTHER_IDS.code, IMAGE_OTHER_LAYOUT.code, IMAGE_OTHER_SPACING.code),
+}
+"""Codes of images that show a board, which is refused."""
 IMAGE_SMALL_SQUARES = Kind(
     "image.small_squares",
     "squares of {square_px:.1f} px (minimum {min_square_px:g} px)",

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array
 from lce_rig.export import ExportJob
 from lce_rig.export.robot_tree import Joint
@@ -59,38 +58,6 @@ def camera_info_text(name: str, intrinsics: Intrinsics, head: Sequence[str]) -> 
 def _matrix(matrix: Array) -> dict[str, Any]:
     n_rows, n_cols = matrix.shape
     return {"rows": n_rows, "cols": n_cols, "data": matrix.ravel()}
-
-
-def load_camera_info(path: Path) -> Intrinsics:
-    """Read a camera_info file of any maker, or the lens that OpenCV's calibration sample writes.
-
-    The projection_matrix, of a rectified image, is not used.
-
-    Raises:
-        ProfileError: it cannot be read, or is none, or of a camera that was not calibrated.
-    """
-    import yaml
-
-    try:
-        text = path.read_bytes()
-        is_opencv = b"!!opencv-matrix" in text
-        # OpenCV's directive and tags are no YAML; what they mark reads as plain mappings.
-        data = yaml.safe_load(text.removeprefix(b"%YAML:1.0").replace(b"!!opencv-matrix", b""))
-        coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
-        size = int(data["image_width"]), int(data["image_height"])
-        K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
-        if is_opencv:
-            perspective = "plumb_bob" if len(coefficients) <= 5 else "rational_polynomial"
-            data.setdefault("distortion_model", "fisheye" if data.get("fisheye_model") else perspective)
-        return Intrinsics.from_ros(str(data["distortion_model"]), K, coefficients, size)
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
-    except KeyError as error:
-        raise ProfileError(f"{path}: not a camera_info file: it has no key {error.args[0]}") from None
-    except TypeError:
-        raise ProfileError(f"{path}: not a camera_info file: a block of it has no keys") from None
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None
 
 
 _OPTIONS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")

@@ -15,7 +15,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
-from lce_rig.export.ros_files import load_camera_info
+from lce_rig.io.camera_description import FORMS, CameraFile, read_cameras
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
@@ -78,7 +78,7 @@ def new_profile(
     recording: Path | None = None,
     lidar_model: str | None = None,
     cameras: Sequence[str] = (),
-    intrinsics: Sequence[Intrinsics] = (),
+    intrinsics: Sequence[Intrinsics | CameraFile] = (),
     source: str = "profile",
 ) -> tuple[str, list[str]]:
     """Write the text of a profile.
@@ -90,7 +90,7 @@ def new_profile(
             folder with point clouds in pcd/. The beams of a LiDAR of no known model are measured in it.
         lidar_model: maker's name of the LiDAR's model; None where it is not known.
         cameras: names of the cameras, in the order of their topics where there is a bag.
-        intrinsics: of the cameras, in the same order; those of a bag where it is empty.
+        intrinsics: of the cameras, in the same order, or one file for all; those of a bag where it is empty.
         source: what to call the text in errors.
 
     Returns:
@@ -102,14 +102,17 @@ def new_profile(
         ProfileError: the parts do not make a valid profile.
     """
     clouds = [] if recording is None else clouds_in(recording)
-    topics = survey_bag(recording) if recording is not None and not clouds else []
+    folder_px = _image_size(recording) if recording is not None and clouds else None
+    skipped: list[str] = []
+    topics = survey_bag(recording, skipped) if recording is not None and not clouds else []
     scans = [topic for topic in topics if topic.kind == "scans"]
     groups = _by_camera([topic for topic in topics if topic.kind != "scans"])
     if recording is not None and not clouds:
         for seen, what in ((scans, "point clouds"), (groups, "images or events")):
             if not seen:
-                listed = "; ".join(map(_line, topics))
+                listed = "; ".join([*map(_line, topics), *skipped])
                 raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", listed)
+        intrinsics = _for_each(intrinsics, len(groups))
         for n, what in ((len(cameras), "names (--camera)"), (len(intrinsics), "--intrinsics")):
             if n not in (0, len(groups)):
                 raise UsageError(
@@ -118,14 +121,15 @@ def new_profile(
                 )
     else:
         groups = [[] for _ in cameras or ("cam",)]
+        intrinsics = _for_each(intrinsics, len(groups))
         if len(intrinsics) != len(groups):
             raise UsageError(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
-                f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.\n"
-                f"{_rough_lens(None if recording is None else _image_size(recording))}",
+                f"Give --intrinsics once for each --camera: a file of a camera, or {_LENS_FORM}.\n"
+                f"{_rough_lens(folder_px)}",
             )
     model = lidar_model or _UNKNOWN_MODEL
-    notes = [_line(topic) for topic in topics]
+    notes = [*map(_line, topics), *skipped]
     if scans:
         names = ["lidar"] if len(scans) == 1 else [f"lidar_{k + 1}" for k in range(len(scans))]
         lidars = {name: _lidar(name, model, topic) for name, topic in zip(names, scans, strict=True)}
@@ -139,7 +143,14 @@ def new_profile(
     for k, (camera, group) in enumerate(zip(list(cameras) or _names(groups), groups, strict=True)):
         frame = next((t.frame for t in group if t.frame and t.frame not in used), None)
         used.add(frame)
-        blocks[camera] = _camera(camera, intrinsics[k] if intrinsics else _lens(camera, group), frame, group)
+        given = intrinsics[k] if intrinsics else _lens(camera, group)
+        if isinstance(given, CameraFile):
+            size_px = next((topic.size_px for topic in group if topic.size_px), folder_px)
+            lens, lines = given.intrinsics(camera, [topic.topic for topic in group], size_px)
+            notes += [f"{camera}: {given.path}: {line}" for line in lines]
+        else:
+            lens = given
+        blocks[camera] = _camera(camera, lens, frame, group)
     data = {
         "format_version": 1,
         "name": name,
@@ -264,8 +275,8 @@ def parse_board(text: str) -> Board:
     raise UsageError(f"--board {text}: give {BOARD_FORM}")
 
 
-def parse_intrinsics(text: str) -> Intrinsics:
-    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
+def parse_intrinsics(text: str) -> Intrinsics | CameraFile:
+    """Read a file of a camera, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
 
     Raises:
         UsageError: it is neither.
@@ -275,8 +286,11 @@ def parse_intrinsics(text: str) -> Intrinsics:
     if len(values) < 5 and not (values and values[0] and model in _FAMILIES):
         path = Path(text)
         if not text or len(text) > 4000 or not path.exists():
-            raise UsageError(f"--intrinsics {text[:200]}: there is no such file", f"Or give {_LENS_FORM}.")
-        return load_camera_info(path)
+            raise UsageError(
+                f"--intrinsics {text[:200]}: there is no such file",
+                f"Give {FORMS}; or {_LENS_FORM}.",
+            )
+        return read_cameras(path)
     size = _SIZE.fullmatch(values[0])
     try:
         if size is None or model not in _FAMILIES:
@@ -285,11 +299,20 @@ def parse_intrinsics(text: str) -> Intrinsics:
     except ValueError:
         models = ", ".join(_FAMILIES)
         raise UsageError(
-            f"--intrinsics {text}: neither a camera_info file nor intrinsics",
+            f"--intrinsics {text}: neither a file of a camera nor intrinsics",
             f"Give {_LENS_FORM}; models: {models}.",
         ) from None
     width, height = map(int, size.groups())
     return Intrinsics(fx, fy, cx, cy, width, height, _FAMILIES[model], tuple(distortion))
+
+
+def _for_each(
+    intrinsics: Sequence[Intrinsics | CameraFile], n_cameras: int
+) -> Sequence[Intrinsics | CameraFile]:
+    """Repeat the only file given for every camera if it describes several."""
+    if len(intrinsics) == 1 and isinstance(intrinsics[0], CameraFile) and len(intrinsics[0].cameras) > 1:
+        return [intrinsics[0]] * n_cameras
+    return intrinsics
 
 
 def _by_camera(topics: Sequence[SensorTopic]) -> list[list[SensorTopic]]:
@@ -325,7 +348,7 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
     why = next((each.note for each in group if each.note), f"no camera_info beside {topic.topic}")
     raise UsageError(
         f"no intrinsics of camera {camera} ({topic.topic}): {why}",
-        f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.\n"
+        f"Give --intrinsics for every camera: a file of a camera, or {_LENS_FORM}.\n"
         f"{_rough_lens(topic.size_px)}",
     )
 
@@ -357,4 +380,4 @@ def _line(topic: SensorTopic) -> str:
     facts += [f"{topic.size_px[0]}x{topic.size_px[1]}"] if topic.size_px else []
     facts += [f"{topic.n_rings} rings"] if topic.n_rings else []
     facts += ["intrinsics in camera_info"] if topic.intrinsics else []
-    return f"{topic.topic}: {', '.join(facts)}"
+    return f"{topic.topic}: {', '.join(facts)}" + (f" ({topic.note})" if topic.note else "")

@@ -55,6 +55,18 @@ def test_a_board_that_was_out_of_sight_is_searched_for_at_once():
     assert nearest_m(see(watcher, 3, 1.0), 3) < 0.3
 
 
+def test_tracker_lens_misfit_is_not_no_board():
+    watcher = BoardTracker(strict(max_reprojection_px=0.001), 1.0)
+    capture = placements()[0]
+    blank = replace(capture.images[0], pixels=np.full_like(capture.images[0].pixels, 90))
+    for k in range(5):
+        see(watcher, 0, 0.1 * k)
+    assert watcher.refusals.by_code() == {"image.misfit": 5}
+    for k in range(2):
+        watcher.sight(Frame(T0_NS + (2 + k) * 10**9, (blank,), capture.scans))
+    assert watcher.refusals.by_code() == {"image.misfit": 5, "image.none": 2}
+
+
 def strict(**limits):
     """Give the rig with other limits on boards."""
     return changed(rig(), quality=changed(rig().quality, **limits))

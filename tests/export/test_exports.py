@@ -17,11 +17,12 @@ from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export
 from lce_rig.export.other_tools import fit_lens
 from lce_rig.export.robot_tree import Joint, RobotTree
-from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
 from lce_rig.export.writing import T_BODY_OPTICAL
+from lce_rig.io.camera_description import read_cameras
 from lce_rig.lens.models import grid_rays
 from tests.export.conftest import reason
+from tests.shared import changed
 
 Make = Callable[..., Calibration]
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10)
@@ -157,7 +158,31 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(rles, make, tm
         head = path.read_text(encoding="utf-8")
         assert "davis/frames" in head and "FOR USE" in head
     assert read_robot_urdf(tmp_path / "rles.urdf")
-    assert load_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
+    lens, _ = read_cameras(tmp_path / "camera_info_davis.yaml").intrinsics()
+    assert lens == rles.cameras["davis"].to_intrinsics()
+
+
+@pytest.mark.parametrize(
+    "pattern", ["camera_info_davis.yaml", "camchain_*.yaml", "fast_livo2_camera_*.yaml", "opencv_*.yaml"]
+)
+@pytest.mark.parametrize(
+    "block",
+    [
+        {},
+        {"model": "equidistant", "distortion": (-0.05, -0.07, 0.09, -0.05)},
+        {"distortion": (-0.3, 0.1, 0.0, 0.0)},
+    ],
+)
+def test_exported_camera_files_are_read_back(rles, make, tmp_path, pattern, block):
+    rig = changed(rles, **{f"cameras__davis__intrinsics__{key}": value for key, value in block.items()})
+    export([make()], rig, tmp_path, formats=["camera_info", "kalibr", "fast_livo2", "opencv"])
+    (path,) = tmp_path.glob(pattern)
+    lens, _ = read_cameras(path).intrinsics()
+    given = rig.cameras["davis"].to_intrinsics()
+    assert (lens.model, lens.width_px, lens.height_px) == (given.model, given.width_px, given.height_px)
+    # Kalibr and FAST-LIVO2 have no k3.
+    rays = given.unproject(np.array([[60.0, 50.0], [170.0, 130.0], [280.0, 200.0]]))
+    assert lens.project(rays)[0] == pytest.approx(given.project(rays)[0], abs=0.1)
 
 
 @pytest.mark.parametrize("version", ["%YAML:1.0", "%YAML 1.2"])
@@ -168,7 +193,7 @@ def test_a_lens_of_opencv_is_read(version, extra, model, tmp_path):
     text += "camera_matrix: " + matrix.format(3, 3, "500., 0., 320., 0., 501., 240., 0., 0., 1.")
     text += "distortion_coefficients: " + matrix.format(4, 1, "0.1, 0.01, 0.001, 0.002")
     (tmp_path / "lens.yaml").write_text(text, encoding="utf-8")
-    lens = load_camera_info(tmp_path / "lens.yaml")
+    lens = read_cameras(tmp_path / "lens.yaml").intrinsics()[0]
     assert (lens.model, lens.fx_px, lens.fy_px, lens.width_px) == (model, 500.0, 501.0, 640)
     assert lens.distortion == (0.1, 0.01, 0.001, 0.002)
 

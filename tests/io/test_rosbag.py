@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,10 +14,11 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.recording import ContinuousRecording
+from lce_rig.io.ros.messages import decode_ros_image
 from lce_rig.rig import load_rig
 from tests.damage import damaged
 from tests.notes import has_note
-from tests.yuv import to_422
+from tests.yuv import to_420, to_422
 
 KINDS = ["ros1", "sqlite3", "mcap"]
 CAM, LIDAR = "/camera/image_raw", "/velodyne_points"
@@ -127,6 +129,24 @@ def test_pictures_of_any_encoding_look_the_same(
         assert image.pixels.shape == wanted.shape
         inner = (slice(2, -2), slice(2, -2))
         assert np.abs(image.pixels[inner].astype(int) - wanted[inner]).max() <= 12
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+@pytest.mark.parametrize("n_padding", [0, 16])
+@pytest.mark.parametrize("counts_both_planes", [False, True])
+def test_image_of_two_planes_is_decoded(image_message, encoding, n_padding, counts_both_planes):
+    ramp = np.linspace(60, 200, 64)
+    bgr = np.dstack([np.tile(ramp, (48, 1)), np.full((48, 64), 90), np.tile(ramp[::-1], (48, 1))])
+    bgr = bgr.astype(np.uint8)
+    planes = np.pad(to_420(bgr, encoding), ((0, 0), (0, n_padding)))
+    fields = {**image_message(planes, T0_NS, encoding), "width": 64, "step": planes.shape[1]}
+    fields["height"] = 72 if counts_both_planes else 48
+    pixels = decode_ros_image(SimpleNamespace(**fields))
+    assert pixels.shape == bgr.shape
+    assert np.abs(pixels.astype(int) - bgr).max() <= 12
+    fields["data"] = fields["data"][:-1]
+    with pytest.raises(ValueError, match="bytes are not"):
+        decode_ros_image(SimpleNamespace(**fields))
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
-from lce_rig.export.ros_files import load_camera_info
+from lce_rig.io.camera_description import read_cameras
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.camera_intrinsics import (
     document,
@@ -121,7 +121,7 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     files = write_intrinsics(session, [measured])
     assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}
     lens = measured.intrinsics
-    info = load_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
+    info = read_cameras(session.path / "intrinsics" / "camera_info_davis.yaml").intrinsics()[0]
     assert (info.matrix == lens.matrix).all()
     (one,) = document(session.rig, [measured])["cameras"]
     assert one["intrinsics"]["cy_px"] == lens.cy_px

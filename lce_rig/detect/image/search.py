@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.camera import Intrinsics
+from lce_rig.core.camera import CUT_FRACTION, Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
@@ -35,8 +35,6 @@ STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Of a search that was not thorough."""
 
-# A part of the image may be missing at its end (a cut-off readout); a larger difference is another mode.
-_CUT_FRACTION = 0.02
 # A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
 _CANVAS_FRACTION = 3.0
 # Corners that the finder misplaced, or that an artefact covers, at most.
@@ -147,7 +145,7 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
     grey = image.grey[:wanted_height, :wanted_width]
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
-    if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
+    if 0 <= missing_u <= CUT_FRACTION and 0 <= missing_v <= CUT_FRACTION:
         return grey
     if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
         # Right of and below the sensor's size there is only a smooth background; the columns next to the

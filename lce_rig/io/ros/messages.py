@@ -105,6 +105,8 @@ _ENCODINGS = {
     **{f"bayer_{m}8": (1, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
     **{f"bayer_{m}16": (2, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
 }
+# A plane of luminance, then one of half its rows with colour.
+_SEMI_PLANAR = {"nv12": "COLOR_YUV2BGR_NV12", "nv21": "COLOR_YUV2BGR_NV21"}
 
 
 def decode_ros_image(message: Any) -> NDArray[np.uint8]:
@@ -128,8 +130,12 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
         conversion = _ENCODINGS[encoding][2]
     else:
         encoding = str(message.encoding).lower()
+        if encoding in _SEMI_PLANAR:
+            return _decode_semi_planar(message, _SEMI_PLANAR[encoding])
         if encoding not in _ENCODINGS:
-            raise ValueError(f"its encoding {encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+            raise ValueError(
+                f"its encoding {encoding!r} is not known: record mono8, bgr8, nv12 or compressed"
+            )
         n_bytes, n_channels, conversion = _ENCODINGS[encoding]
         width, height = int(message.width), int(message.height)
         n_row = width * n_channels * n_bytes
@@ -147,6 +153,27 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
     import cv2
 
     return np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
+
+
+def _decode_semi_planar(message: Any, conversion: str) -> NDArray[np.uint8]:
+    """Decode NV12 or NV21 to (H, W, 3) BGR.
+
+    Raises:
+        ValueError: the sizes contradict each other.
+    """
+    import cv2
+
+    width, height = int(message.width), int(message.height)
+    step = int(message.step) or width
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    # Some drivers count the rows of both planes.
+    if len(data) == step * height and height % 3 == 0:
+        height = height * 2 // 3
+    n_rows = height * 3 // 2
+    if width * height == 0 or width % 2 or height % 2 or step < width or len(data) < n_rows * step:
+        raise ValueError(f"{len(data)} bytes are not a {width}x{height} image with rows of {step} bytes")
+    planes = np.ascontiguousarray(data[: n_rows * step].reshape(n_rows, step)[:, :width])
+    return np.asarray(cv2.cvtColor(planes, getattr(cv2, conversion)), dtype=np.uint8)
 
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

@@ -1,6 +1,7 @@
 """A bag's topics: their assignment to the sensors of a rig, and a survey of them for a new profile."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
+from lce_rig.io.camera_description import describe_message, is_rectified
 from lce_rig.io.recording import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import EVENT_TYPES, read_event_head
@@ -28,6 +30,10 @@ CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES
 PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 _INFO = "sensor_msgs/CameraInfo"
+# Images that image_proc computes from image_raw: as a second camera they would count twice.
+_COMPUTED = frozenset({"image_mono", "image_color", "image_rect", "image_rect_color"})
+# Messages of video, as theora_image_transport/Packet and foxglove_msgs/CompressedVideo.
+_VIDEO = re.compile(r"image_transport\w*/|CompressedVideo$")
 # Drivers start within this many messages of each other.
 _N_PROBED = 5000
 Topics: TypeAlias = Mapping[str, tuple[str, int]]
@@ -86,6 +92,10 @@ def choose_topics(
     def take(target: Target, topic: str, reason: str) -> None:
         chosen[topic] = target
         notes.append(f"{path.name}: {target} from {topic}{reason}")
+        camera = rig.cameras.get(target.sensor) if target.channel is not None else None
+        if camera is not None and is_rectified(topic) and any(camera.intrinsics.distortion):
+            what = f"{topic} has rectified images, and the profile's intrinsics of {target.sensor} distortion"
+            notes.append(f"{path.name}: {what}: enter the projection matrix, without distortion")
 
     for target, profile_topic in targets.items():
         candidates = [asked[target]] if target in asked else [profile_topic] if profile_topic else []
@@ -172,8 +182,8 @@ class SensorTopic:
         frame: of the first message's header, "" without.
         size_px: (width, height) of images and event arrays; None where they do not say.
         n_rings: number of rings of a scan; None where points have none.
-        intrinsics: by the camera_info topic in the same namespace; None where there is no usable one.
-        note: the reason for which the one there is unusable; "" otherwise.
+        intrinsics: of its images, by its camera_info topic; None where there is no usable one.
+        note: the reason for which that is unusable, or what was done to fit it to the images.
         cloud: the first point cloud of a topic of scans; None where it has packets.
     """
 
@@ -191,18 +201,27 @@ class SensorTopic:
     @property
     def namespace(self) -> str:
         """The topic without its last part, and without that of a transport such as compressed."""
-        return _namespace(self.topic.removesuffix("/compressed").removesuffix("/theora"))
+        return _namespace(self.image_topic)
+
+    @property
+    def image_topic(self) -> str:
+        """The topic without the part of a transport, such as compressed."""
+        return self.topic.removesuffix("/compressed").removesuffix("/theora")
 
 
 def _namespace(topic: str) -> str:
     return "/".join([part for part in topic.split("/") if part][:-1])
 
 
-def survey_bag(path: Path) -> list[SensorTopic]:
+def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic]:
     """List the topics of a bag with images, events and point clouds, in the order of their names.
 
     Depth images and images that are another topic's compressed ones are left out, and packets where there are
     point clouds.
+
+    Args:
+        path: the bag.
+        skipped: receives the topics that cannot be decoded, with the reason.
 
     Raises:
         SourceError: it cannot be read, or holds no such topic.
@@ -224,22 +243,34 @@ def survey_bag(path: Path) -> list[SensorTopic]:
     except SourceError:
         if not first:
             raise
-    sensors = []
+    sensors, skipped = [], [] if skipped is None else skipped
+    skipped += [
+        f"{topic}: skipped, {kind} is not read: record raw or compressed images"
+        for topic, kind in types.items()
+        if _VIDEO.search(kind)
+    ]
+    skipped += [
+        f"{topic}: skipped, it has none of the first {_N_PROBED} messages"
+        for topic in sorted(wanted - first.keys())
+    ]
     for topic in sorted(wanted & first.keys()):
         message, n = first[topic], bag.topics[topic][1]
         try:
             sensor = _probe(message, n)
-        except (SourceError, ValueError):
-            continue  # No image or scan that can be used.
+        except (SourceError, ValueError) as error:
+            skipped.append(f"{topic}: skipped, {error}")
+            continue
         if n > 1 and bag.end_ns > message.log_ns:
             sensor = replace(sensor, rate_hz=(n - 1) / ((bag.end_ns - message.log_ns) * 1e-9))
         if sensor.kind != "scans":
-            beside = [info for info in infos & first.keys() if _namespace(info) == sensor.namespace]
-            sensor = _with_lens(sensor, first[min(beside)]) if beside else sensor
+            info = _info_of(sensor, infos & first.keys())
+            sensor = sensor if info is None else _with_lens(sensor, first[info])
         sensors.append(sensor)
     if not sensors:
-        raise SourceError(f"{path}: no images, events or point clouds", list_topics(bag.topics))
-    return sensors
+        raise SourceError(
+            f"{path}: no images, events or point clouds", "\n".join([*skipped, list_topics(bag.topics)])
+        )
+    return _without_computed(sensors, skipped)
 
 
 def _probe(message: RawMessage, n: int) -> SensorTopic:
@@ -269,14 +300,43 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
     return SensorTopic(message.topic, "scans", n, frame=frame, n_rings=n_rings, cloud=cloud)
 
 
+def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[SensorTopic]:
+    """Leave out images that are computed from raw ones beside them; `skipped` receives them."""
+    raw = {sensor.namespace: sensor.topic for sensor in sensors if sensor.image_topic.endswith("/image_raw")}
+    kept = []
+    for sensor in sensors:
+        is_computed = sensor.image_topic.rpartition("/")[2] in _COMPUTED
+        if is_computed and sensor.namespace in raw:
+            skipped.append(f"{sensor.topic}: skipped, it is computed from {raw[sensor.namespace]}")
+        else:
+            kept.append(sensor)
+    return kept
+
+
+def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
+    """Name the camera_info topic of an image's topic; None if there is none.
+
+    Drivers put it beside the image, also with the same beginning (left_camera_info for left_image), or below.
+    """
+    beside = sorted(info for info in infos if _namespace(info) == sensor.namespace)
+    last = sensor.image_topic.rpartition("/")[2]
+    stems = [info for info in beside if last.startswith(_stem(info) or "/")]
+    own = [info for info in infos if info == f"{sensor.image_topic}/camera_info"]
+    # Another image's has its stem.
+    common = [info for info in beside if not _stem(info)]
+    return next(iter([*own, *stems, *common]), None)
+
+
+def _stem(info: str) -> str:
+    """Return what stands before camera_info in the last part of a topic, as "left_"."""
+    return info.rpartition("/")[2].partition("camera_info")[0]
+
+
 def _with_lens(sensor: SensorTopic, message: RawMessage) -> SensorTopic:
-    """Add the intrinsics of the camera_info topic of an image's namespace."""
+    """Add the intrinsics of a camera_info topic."""
     try:
-        info: Any = deserialize(message)
-        # ROS 1 has capital letters.
-        K, D = (info.k, info.d) if hasattr(info, "k") else (info.K, info.D)
-        size = int(info.width), int(info.height)
-        lens = Intrinsics.from_ros(str(info.distortion_model), np.asarray(K), tuple(D), size)
-        return replace(sensor, intrinsics=lens)
+        camera = describe_message(deserialize(message))
+        lens, notes = camera.intrinsics(sensor.size_px, is_rectified=is_rectified(sensor.topic))
     except ValueError as error:
         return replace(sensor, note=f"{message.topic}: {error}")
+    return replace(sensor, intrinsics=lens, note=f"{message.topic}: {'; '.join(notes)}" if notes else "")
