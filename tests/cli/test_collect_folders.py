@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.core.files import encode_pcd
+from lce_rig.core.pcd import encode_pcd
 
 TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
 
