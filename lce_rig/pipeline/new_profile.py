@@ -16,6 +16,7 @@ from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.ros_files import load_camera_info
+from lce_rig.io.beams import compare_beams, measure_elevations, suggest_models
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
@@ -25,8 +26,6 @@ from lce_rig.rig.loading import Document, board_of, dump_yaml, rig_from_document
 from lce_rig.rig.sensors import lens_block
 
 _UNKNOWN_MODEL = "other"
-# A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
-_HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
 _PLATE = r"([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?"
 _BOARDS: dict[BoardType, re.Pattern[str]] = {
     "checkerboard": re.compile(rf"(?:checkerboard:)?(\d+)x(\d+),([^,x]+)(),{_PLATE}"),
@@ -128,10 +127,13 @@ def new_profile(
     notes = [_line(topic) for topic in topics]
     if scans:
         names = ["lidar"] if len(scans) == 1 else [f"lidar_{k + 1}" for k in range(len(scans))]
-        lidars = {name: _lidar(name, model, topic) for name, topic in zip(names, scans, strict=True)}
+        lidars = {
+            name: _lidar(name, model, notes, topic, topic.cloud, topic.topic)
+            for name, topic in zip(names, scans, strict=True)
+        }
     else:
         cloud = read_cloud(clouds[0]) if clouds else None
-        lidars = {"lidar": _lidar("lidar", model, None, cloud, str(clouds[0]) if clouds else "")}
+        lidars = {"lidar": _lidar("lidar", model, notes, None, cloud, str(clouds[0]) if clouds else "")}
         if rings := lidars["lidar"].get("elevations_deg"):
             notes.append(f"lidar: {len(rings)} rings, {lidars['lidar'].get('columns', 'unknown')} columns")
     used = {block["frame"] for block in lidars.values()}
@@ -161,22 +163,46 @@ def new_profile(
 
 
 def _lidar(
-    name: str, model: str, topic: SensorTopic | None, cloud: NDArray[Any] | None = None, where: str = ""
+    name: str,
+    model: str,
+    notes: list[str],
+    topic: SensorTopic | None,
+    cloud: NDArray[Any] | None,
+    where: str,
 ) -> dict[str, Any]:
-    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows."""
+    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows.
+
+    Args:
+        name: of the LiDAR.
+        model: as it was named.
+        notes: receives in what the cloud's rings differ from the model's.
+        topic: that the cloud is from; None without a bag.
+        cloud: one scan; None where there is none.
+        where: file or topic, for messages.
+    """
     block: dict[str, Any] = {"model": model, "frame": f"{name}_link"}
+    sheet = find_data_sheet(model)
+    settings = LidarSettings.model_validate({"model": model})
     if topic is not None:
         block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
         rate_hz = round(topic.rate_hz or 0.0, 1)
-        # Single scans, seconds apart, say nothing of how fast the LiDAR turns.
-        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ else {}
-        cloud, where = topic.cloud, topic.topic
-    if find_data_sheet(model) is None:
+        # Single scans, seconds apart, say nothing of how fast the LiDAR turns; without rings, scans are
+        # accumulated to the rate of the profile, whatever rate they come at.
+        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ and settings.has_rings else {}
+    if sheet is not None and sheet.has_rings and cloud is not None:
+        try:
+            found = compare_beams(to_scan(cloud, name, settings, where), settings)
+            notes.extend(finding.sentence for finding in found)
+        except SourceError as error:
+            notes.append(error.what)
+    if sheet is None:
         if cloud is not None:
-            scan = to_scan(cloud, name, LidarSettings.model_validate({"model": model}), where)
+            scan = to_scan(cloud, name, settings, where)
             elevations_deg, columns = measure_beams(scan)
             block["elevations_deg"] = [round(value, 2) for value in elevations_deg]
             block |= {} if columns is None else {"columns": columns}
+            if alike := suggest_models(np.array(elevations_deg)):
+                notes.append(f"{name}: a {' or '.join(alike)} has such rings: name it with --lidar")
         block |= {
             "laser_bias_sigma_m": TYPICAL.laser_bias_sigma_m,
             "range_offset_sigma_m": TYPICAL.range_offset_sigma_m,
@@ -213,9 +239,6 @@ def clouds_in(folder: Path) -> list[Path]:
 def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
     """Measure a LiDAR's beams in one of its scans.
 
-    A laser h above the frame's origin and inclined by alpha draws the line z = rho tan(alpha) + h over the
-    distance rho from the axis: z / rho is fitted against 1 / rho for each ring.
-
     Args:
         scan: of at least a few metres around, in the LiDAR's own frame.
 
@@ -223,22 +246,9 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
         The elevation of each ring in deg, from the lowest; firings of each ring per revolution, None where
         too few returns follow each other.
     """
-    rho = np.hypot(scan.points[:, 0], scan.points[:, 1]).astype(np.float64)
-    x, y = 1 / rho, scan.points[:, 2] / rho
-    elevations = []
-    for ring in np.unique(scan.ring):
-        mine = scan.ring == ring
-        # Fit twice: returns of foreign rings and of edges are few, but far off.
-        for _ in range(2):
-            dx, dy = x[mine] - x[mine].mean(), y[mine] - y[mine].mean()
-            height_m = float(np.clip((dx @ dy) / (dx @ dx + _HEIGHT_PRIOR * mine.sum()), -0.05, 0.05))
-            slope = float(np.median(y[mine] - height_m * x[mine]))
-            mine = mine & (np.abs(y - height_m * x - slope) < 0.01)
-            if not mine.any():
-                break
-        elevations.append(float(np.degrees(np.arctan(slope))))
+    elevations = measure_elevations(scan)
     step_rad = order_scan(scan, min_range_m=0.3).step_rad
-    return sorted(elevations), round(2 * np.pi / step_rad) if step_rad > 0 else None
+    return sorted(elevations.tolist()), round(2 * np.pi / step_rad) if step_rad > 0 else None
 
 
 def parse_board(text: str) -> Board:
