@@ -16,9 +16,13 @@ from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.ros_files import load_camera_info
+from lce_rig.io import recognise
 from lce_rig.io.beams import compare_beams, measure_elevations, suggest_models
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
+from lce_rig.io.decoding import read_cloud, read_image
+from lce_rig.io.folder import list_files
+from lce_rig.io.ros.bag_file import SUFFIXES as BAGS
+from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
 from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
@@ -68,6 +72,10 @@ _LENS_FORM = (
     "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
 _USUAL_SIZE_PX = (1280, 720)
+_NUMBERS_HINT = (
+    "Leave --from out and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
+    "--intrinsics radtan,1280x720,1000,1000,640,360,0,0,0,0 --board 8x6,0.07,0.767x0.626"
+)
 
 
 def new_profile(
@@ -86,7 +94,7 @@ def new_profile(
         name: of the rig.
         board: as it was measured.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
-            folder with point clouds in pcd/. The beams of a LiDAR of no known model are measured in it.
+            folder with images and point clouds. The beams of a LiDAR of no known model are measured in it.
         lidar_model: maker's name of the LiDAR's model; None where it is not known.
         cameras: names of the cameras, in the order of their topics where there is a bag.
         intrinsics: of the cameras, in the same order; those of a bag where it is empty.
@@ -100,8 +108,7 @@ def new_profile(
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
-    clouds = [] if recording is None else clouds_in(recording)
-    topics = survey_bag(recording) if recording is not None and not clouds else []
+    topics, images, clouds = _survey(recording)
     scans = [topic for topic in topics if topic.kind == "scans"]
     groups = _by_camera([topic for topic in topics if topic.kind != "scans"])
     if recording is not None and not clouds:
@@ -121,7 +128,7 @@ def new_profile(
             raise UsageError(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
                 f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.\n"
-                f"{_rough_lens(None if recording is None else _image_size(recording))}",
+                f"{_rough_lens(_image_size(images))}",
             )
     model = lidar_model or _UNKNOWN_MODEL
     notes = [_line(topic) for topic in topics]
@@ -160,6 +167,25 @@ def new_profile(
         comment = _COMMENTS.get(line.strip().partition(":")[0])
         lines.append(f"{line:<40} # {comment}" if comment else line)
     return "\n".join(lines) + "\n", notes
+
+
+def _survey(recording: Path | None) -> tuple[list[SensorTopic], list[Path], list[Path]]:
+    """List the topics of a bag, or the images and point clouds of a folder.
+
+    Raises:
+        SourceError: nothing is there that describes a rig's sensors.
+    """
+    if recording is None:
+        return [], [], []
+    kind = recognise(recording)
+    if kind == "folder":
+        bags = [entry for entry in sorted(recording.iterdir()) if entry.is_dir() and kind_of(entry) == ".bag"]
+        if len(bags) != 1:
+            return [], *list_files(recording)
+        recording = bags[0]
+    elif kind not in BAGS:
+        raise SourceError(f"{recording}: a {kind} file does not describe the rig's sensors", _NUMBERS_HINT)
+    return survey_bag(recording), [], []
 
 
 def _lidar(
@@ -228,12 +254,6 @@ def _camera(
             for kind, channel in (channels or {"frames": {"kind": "frames"}}).items()
         },
     }
-
-
-def clouds_in(folder: Path) -> list[Path]:
-    """List the point clouds of a folder that holds images and them, by name; empty for any other."""
-    there = (folder / "pcd").iterdir() if (folder / "pcd").is_dir() else ()
-    return sorted(path for path in there if path.suffix in DECODERS)
 
 
 def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
@@ -340,9 +360,9 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
     )
 
 
-def _image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) of a folder's first sound image; None without one."""
-    for path in sorted(path for path in folder.glob("img/**/*.*") if path.suffix.lower() in SUFFIXES):
+def _image_size(images: Sequence[Path]) -> tuple[int, int] | None:
+    """Return the width and height (px) of the first sound image; None without one."""
+    for path in images:
         with suppress(SourceError):
             height, width = read_image(path).shape[:2]
             return width, height
