@@ -342,8 +342,9 @@ def _times(
     if stamp_ns is None:
         return offset_ns, None
     first_ns, last_ns = round(float(first) * scale), round(float(ticks.max()) * scale)
-    if abs(first_ns) > 10**12:
-        # Times since an epoch: only the timestamp's own clock counts, for the cameras' sake.
+    if abs(first_ns) > 10**12 or first_ns > 10**9 > abs(first_ns - stamp_ns):
+        # Times since an epoch, or since the LiDAR's start: only the timestamp's own clock counts, for the
+        # cameras' sake.
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns

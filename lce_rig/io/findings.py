@@ -71,6 +71,12 @@ def _nmea_of_other_second(finding: Finding) -> str:
 
 LIDAR_UTC = note_kind("clock.lidar_utc", _lidar_utc)
 HOST_WANTED = note_kind("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host")
+CLOCK_BY_RECEIPT = note_kind(
+    "clock.by_receipt",
+    "the timestamps of {subject} are of another clock, mapped by {n} times of receipt: {offset_s:+.3f} s, "
+    "drift {drift_ppm:.1f} ppm, uncertainty {sigma_ms:.0f} ms",
+    "hold boards still",
+)
 ARRIVALS_UNKNOWN = note_kind(
     "clock.arrivals_unknown", "scans are not timestamped: their arrivals and so the hour are unknown"
 )

@@ -96,7 +96,7 @@ def read_profile(path: Path) -> str:
             return path.read_text(encoding="utf-8")
         except UnicodeDecodeError:
             hint = "Give the YAML file of a rig; recordings are given with --from."
-            raise ProfileError(f"{path} is not a profile: it is not text", hint) from None
+            raise ProfileError(f"{path}: it is no profile, as it is not text", hint) from None
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:
