@@ -20,8 +20,8 @@ from lce_rig.timing.clock_fit import fit_clock
 
 # Larger differences of two sensors' delays, s, are of their clocks: messages wait less in any pipeline.
 _MAX_DELAY_S = 2.0
-# Messages read to find the delays, in all and of each topic.
-_N_PROBED, _N_OF_TOPIC = 2000, 20
+# Messages read to find the delays, in all and of each topic: raw images have megabytes.
+_N_PROBED, _N_OF_TOPIC = 500, 5
 # Larger drifts are no crystal's, but the scatter of few receipts.
 _MAX_DRIFT = 200e-6
 # Standard deviation of the unknown part of a delay: transport, and processing by the driver.
@@ -104,7 +104,9 @@ def _read_times(
             seconds, nanoseconds = struct.unpack_from("<II", message.data, _TIME_AT)
             if seconds or nanoseconds:
                 times[message.topic].append((seconds * 10**9 + nanoseconds, message.log_ns))
-        if n_of_topic is not None and all(len(of_topic) >= n_of_topic for of_topic in times.values()):
+        if n_of_topic is not None and all(
+            len(rows) >= min(n_of_topic, bag.topics[t][1]) for t, rows in times.items()
+        ):
             break
     columns = {topic: np.array(rows, np.int64).T for topic, rows in times.items() if rows}
     return {t: rows[0] for t, rows in columns.items()}, {t: rows[1] for t, rows in columns.items()}
