@@ -31,7 +31,7 @@ BEAMS_OF_OTHER_MODEL = warning_kind(
 )
 RINGS_SKIPPED = warning_kind(
     "recording.rings_skipped",
-    "{subject}: {n_seen} of {n_rings} rings in each direction: 1 in {every:.0f} points is sent",
+    "{subject}: {n_seen} of {n_rings} rings in each direction: points are skipped",
     "record every point (point_filter_num: 1), or correct lidars.{subject}.model",
 )
 
