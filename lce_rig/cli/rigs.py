@@ -8,11 +8,10 @@ import numpy as np
 
 from lce_rig.cli import show
 from lce_rig.core.board import Board, BoardType
-from lce_rig.core.errors import ProfileError, SourceError, TargetError, UsageError
+from lce_rig.core.errors import ProfileError, TargetError, UsageError
 from lce_rig.core.pattern import DICTIONARIES, dark_rectangles, n_markers_of
-from lce_rig.io import RECORDINGS
-from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
-from lce_rig.pipeline.new_profile import BOARD_FORM, clouds_in, parse_board, parse_intrinsics
+from lce_rig.io import recognise
+from lce_rig.pipeline.new_profile import BOARD_FORM, parse_board, parse_intrinsics
 from lce_rig.pipeline.new_profile import new_profile as draft
 from lce_rig.rig import (
     Rig,
@@ -79,7 +78,7 @@ def check_profile(file: str) -> None:
     "--from",
     "origin",
     metavar="RIG|RECORDING",
-    help="Profile to derive from, or a bag of the rig, or a folder with point clouds in pcd/ "
+    help="Profile to derive from, or a bag of the rig, or a folder with images and point clouds "
     "[default: rlfs, unless a sensor is given].",
 )
 @click.option(
@@ -142,15 +141,15 @@ def new_profile(
     path = Path(output or f"{name}.yaml")
     target = f"{name if output == '-' else path} (not written)"
     has_sensors = bool(lidar or cameras or intrinsics)
-    bag = None if origin is None or not _is_bag(Path(origin)) else Path(origin)
-    if bag is not None or (origin is None and has_sensors):
+    recording = _find_recording(origin)
+    if recording is not None or (origin is None and has_sensors):
         if board is None:
             raise UsageError("the board is missing", f"Measure it, and add --board {BOARD_FORM}")
         lenses = [parse_intrinsics(each) for each in intrinsics]
         text, lines = draft(
             name,
             parse_board(board),
-            recording=bag,
+            recording=recording,
             lidar_model=lidar,
             cameras=cameras,
             intrinsics=lenses,
@@ -185,30 +184,16 @@ def new_profile(
     show.warn_of(load_rig(path).warnings())
 
 
-_NUMBERS_HINT = (
-    "Leave --from out and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
-    "--intrinsics radtan,1280x720,1000,1000,640,360,0,0,0,0 --board 8x6,0.07,0.767x0.626"
-)
-
-
-def _is_bag(path: Path) -> bool:
-    """Tell a bag from a profile, by its suffix or what lies in the folder.
+def _find_recording(origin: str | None) -> Path | None:
+    """Return the path of a recording; None for the name or the file of a profile.
 
     Raises:
-        SourceError: it would be a bag, and is not there; or a folder without one.
+        SourceError: it is neither, or not there.
     """
-    if path.is_dir():
-        if any(is_bag_file(entry) for entry in path.iterdir()) or clouds_in(path):
-            return True
-        raise SourceError(
-            f"{path} holds no bag ({', '.join(SUFFIXES)}) and no point clouds in pcd/",
-            _NUMBERS_HINT,
-        )
-    if path.is_file() and path.suffix.lower() in RECORDINGS and path.suffix not in SUFFIXES:
-        raise SourceError(f"{path}: a {path.suffix} file does not describe the rig's sensors", _NUMBERS_HINT)
-    if path.suffix.lower() in RECORDINGS and not path.exists():
-        raise SourceError(f"{path} does not exist")
-    return path.suffix in SUFFIXES
+    if origin is None or (not Path(origin).is_dir() and Path(origin).suffix.lower() in ("", ".yaml", ".yml")):
+        return None
+    recognise(Path(origin))
+    return Path(origin)
 
 
 def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:

@@ -20,6 +20,7 @@ from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.phrasing import as_line
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.finder import check_origin
+from lce_rig.io.beams import compare_beams
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.recording import (
     ContinuousRecording,
@@ -122,6 +123,7 @@ class _Collector:
                     self._names_by_key[source["key"]] = capture.name
         self._n_captures = len(session.captures)
         self._torn: SourceError | None = None
+        self._compared = set[str]()  # LiDARs whose beams were compared with their model's
 
     def take_pairs(self, recording: FolderRecording) -> None:
         """Capture every pair of a folder.
@@ -143,6 +145,7 @@ class _Collector:
                     images, scans, notes = files.read()
                     for scan in scans:
                         _require_own_frame(scan, files.label)
+                        self._compare_beams(scan)
                     self.report.note(notes)
                     self._store(key, files.label, images, scans, {})
             except SourceError as error:
@@ -285,6 +288,13 @@ class _Collector:
         self._n_captures += 1
         self.report.captured.append(name)
 
+    def _compare_beams(self, scan: Scan) -> None:
+        """Note once where a LiDAR's rings are not those of its model."""
+        if scan.sensor not in self._compared:
+            self._compared.add(scan.sensor)
+            found = compare_beams(scan, self._session.rig.lidars[scan.sensor])
+            self.report.note(finding.sentence for finding in found)
+
     def _is_enough(self) -> bool:
         return self._n_wanted is not None and self._n_captures >= self._n_wanted
 
@@ -297,6 +307,7 @@ class _Collector:
                 if isinstance(sample, Scan) and sample.sensor not in known:
                     _require_own_frame(sample, str(recording.path))
                     known.add(sample.sensor)
+                    self._compare_beams(sample)
                 yield sample
                 if not isinstance(sample, Events):
                     done += 1

@@ -32,13 +32,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         SourceError: nothing is there, or nothing that can be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise SourceError(f"{path} does not exist")
-    kind = kind_of(path)
-    if kind not in RECORDINGS:
-        known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
-        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
-        raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
+    kind = recognise(path)
     options = options or SourceOptions()
     reader = RECORDINGS[kind]
     if kind in _PACKETS:
@@ -48,6 +42,22 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         reader = "lce_rig.io.folder:ImagesRecording"
     recording: Recording = resolve_name(reader)(path, rig, options)
     return recording
+
+
+def recognise(path: Path) -> str:
+    """Name the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
+
+    Raises:
+        SourceError: nothing is there, or no recording.
+    """
+    if not path.exists():
+        raise SourceError(f"{path} does not exist")
+    kind = kind_of(path)
+    if kind not in RECORDINGS:
+        known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
+        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
+        raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
+    return kind
 
 
 def open_recordings(
@@ -97,9 +107,9 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [(path, options)]
     entries = sorted(entry for entry in path.iterdir() if entry.name[0] != ".")
-    kinds = {suffix: [e for e in entries if e.is_file() and e.suffix.lower() in suffix] for suffix in _KINDS}
+    kinds = {suffixes: [e for e in entries if e.is_file() and kind_of(e) in suffixes] for suffixes in _KINDS}
     folders, images = [entry for entry in entries if entry.is_dir()], list[Path]()
-    if not all(any(file.suffix.lower() in _BAGS for file in folder.iterdir()) for folder in folders):
+    if not all(kind_of(folder) in _BAGS for folder in folders):
         if not kinds[_PACKETS] or _holds_clouds(path):
             return [(path, options)]  # Of images and point clouds, whatever lies beside them.
         folders, images = [], [path]

@@ -161,7 +161,8 @@ def to_scan(
         notes: receives what the point cloud lacks or how it was understood, in words.
 
     Returns:
-        The points with a return: finite, and neither at the origin nor above or below it.
+        The points with a return: finite, neither at the origin nor above or below it, and not nearer than
+        `min_range_m`.
 
     Raises:
         SourceError: no coordinates, no valid point, coordinates that are not metres, or no rings and none
@@ -186,6 +187,14 @@ def to_scan(
     is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
     if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
+    # Returns of the LiDAR's housing and mount, which lie on no ring and are not used.
+    is_far = is_kept & (np.hypot(flat_m, z) >= settings.min_range_m)
+    if not is_far.any():
+        raise SourceError(
+            f"{where}: all {is_kept.sum()} returns are nearer than min_range_m {settings.min_range_m:g} m",
+            "Correct the LiDAR's model or min_range_m in the profile.",
+        )
+    is_kept = is_far
     median_m = float(np.median(np.hypot(flat_m, z)[is_kept]))
     if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
         raise SourceError(
@@ -204,9 +213,6 @@ def to_scan(
         ring = _ring(cloud, fields, points, where, notes)
     else:
         ring = np.full(len(points), NO_RING, dtype=np.int16)
-    sheet, n_rings = settings.data_sheet(), len(np.unique(ring))
-    if sheet is not None and sheet.has_rings and n_rings > sheet.n_rings:
-        notes.add(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     name = _find(fields, INTENSITY_FIELDS)
     if name is None:
@@ -336,8 +342,9 @@ def _times(
     if stamp_ns is None:
         return offset_ns, None
     first_ns, last_ns = round(float(first) * scale), round(float(ticks.max()) * scale)
-    if abs(first_ns) > 10**12:
-        # Times since an epoch: only the timestamp's own clock counts, for the cameras' sake.
+    if abs(first_ns) > 10**12 or first_ns > 10**9 > abs(first_ns - stamp_ns):
+        # Times since an epoch, or since the LiDAR's start: only the timestamp's own clock counts, for the
+        # cameras' sake.
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.errors import SourceError, reading
-from lce_rig.core.files import decode_pcd, decode_pixels
+from lce_rig.core.files import decode_pixels
+from lce_rig.core.pcd import decode_pcd
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 _MAX_SAMPLED = 1 << 24

@@ -22,6 +22,19 @@ OUT_OF_ORDER = _loss("out_of_order", "{n} sent twice or out of order, skipped")
 CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more than 1 s")
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
 
+BEAMS_OF_OTHER_MODEL = warning_kind(
+    "recording.beams_of_other_model",
+    "{subject}: {n_rings} rings from {low_deg:.1f} to {high_deg:.1f} deg, model {model} has {n_model} "
+    "from {model_low_deg:.1f} to {model_high_deg:.1f} deg",
+    "name the LiDAR's model in lidars.{subject}.model",
+    actions={"named": "set lidars.{subject}.model to {names}"},
+)
+RINGS_SKIPPED = warning_kind(
+    "recording.rings_skipped",
+    "{subject}: {n_seen} of {n_rings} rings in each direction: points are skipped",
+    "record every point (point_filter_num: 1), or correct lidars.{subject}.model",
+)
+
 
 DAMAGED = warning_kind("packet.damaged", "{n} damaged packets skipped (first: {where})")
 OTHER_MODEL = warning_kind(
@@ -58,6 +71,12 @@ def _nmea_of_other_second(finding: Finding) -> str:
 
 LIDAR_UTC = note_kind("clock.lidar_utc", _lidar_utc)
 HOST_WANTED = note_kind("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host")
+CLOCK_BY_RECEIPT = note_kind(
+    "clock.by_receipt",
+    "the timestamps of {subject} are of another clock, mapped by {n} times of receipt: {offset_s:+.3f} s, "
+    "drift {drift_ppm:.1f} ppm, uncertainty {sigma_ms:.0f} ms",
+    "hold boards still",
+)
 ARRIVALS_UNKNOWN = note_kind(
     "clock.arrivals_unknown", "scans are not timestamped: their arrivals and so the hour are unknown"
 )

@@ -140,6 +140,22 @@ def _by_sensor(
     return {}
 
 
+def list_files(folder: Path) -> tuple[list[Path], list[Path]]:
+    """List the images and the point clouds of one camera and one LiDAR in a folder, unread.
+
+    Returns:
+        Images, empty where there are none or several cameras'; point clouds.
+
+    Raises:
+        SourceError: no point clouds, or those of several LiDARs.
+    """
+    clouds = _list(folder, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", [])
+    try:
+        return _list(folder, IMAGE_FOLDERS, SUFFIXES, "images", []), clouds
+    except SourceError:
+        return [], clouds
+
+
 def _list(
     folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
 ) -> list[Path]:

@@ -17,6 +17,8 @@ from lce_rig.timing.scan_pairing import event_channel, rig_time_ns, stream_of
 
 _END_BYTES = 65536
 _MAX_OFFSET_S = 3600.0
+# September 2001: clocks that count from 1970 read more, those that count from their start less.
+_SINCE_1970_S = 1e9
 _CLOCK_JUMP_NS = 1_000_000_000
 # Packets of events count by their first timestamp.
 _ROUGH_S = 0.2
@@ -233,6 +235,14 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
                 hint = (
                     "If they were recorded together, add the difference of their clocks to "
                     f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
+                )
+            if min(scan_0, first) < _SINCE_1970_S <= max(scan_0, first):
+                if scan_0 < first:
+                    key = f"lidars.{lidar.sensor}.timestamps.expected_offset_s"
+                hint = (
+                    f"{lidar if scan_0 < first else camera} counts from its start. Record both into one bag, "
+                    "whose times of receipt relate the clocks, or add their difference to "
+                    f"{key} in the profile ({abs(scan_0 - first):+.1f} s if both were started at once)."
                 )
             raise SourceError(
                 f"{camera}: {camera.kind} run from {first:.3f} to {last:.3f} s, "

@@ -15,9 +15,14 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
+from lce_rig.io import recognise
+from lce_rig.io.beams import compare_beams, measure_elevations, suggest_models
 from lce_rig.io.camera_description import FORMS, CameraFile, read_cameras
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
+from lce_rig.io.decoding import read_cloud, read_image
+from lce_rig.io.folder import list_files
+from lce_rig.io.ros.bag_file import SUFFIXES as BAGS
+from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
 from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
@@ -25,8 +30,6 @@ from lce_rig.rig.loading import Document, board_of, dump_yaml, rig_from_document
 from lce_rig.rig.sensors import lens_block
 
 _UNKNOWN_MODEL = "other"
-# A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
-_HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
 _PLATE = r"([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?"
 _BOARDS: dict[BoardType, re.Pattern[str]] = {
     "checkerboard": re.compile(rf"(?:checkerboard:)?(\d+)x(\d+),([^,x]+)(),{_PLATE}"),
@@ -69,6 +72,10 @@ _LENS_FORM = (
     "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
 _USUAL_SIZE_PX = (1280, 720)
+_NUMBERS_HINT = (
+    "Leave --from out and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
+    "--intrinsics radtan,1280x720,1000,1000,640,360,0,0,0,0 --board 8x6,0.07,0.767x0.626"
+)
 
 
 def new_profile(
@@ -87,7 +94,7 @@ def new_profile(
         name: of the rig.
         board: as it was measured.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
-            folder with point clouds in pcd/. The beams of a LiDAR of no known model are measured in it.
+            folder with images and point clouds. The beams of a LiDAR of no known model are measured in it.
         lidar_model: maker's name of the LiDAR's model; None where it is not known.
         cameras: names of the cameras, in the order of their topics where there is a bag.
         intrinsics: of the cameras, in the same order, or one file for all; those of a bag where it is empty.
@@ -101,10 +108,9 @@ def new_profile(
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
-    clouds = [] if recording is None else clouds_in(recording)
-    folder_px = _image_size(recording) if recording is not None and clouds else None
     skipped: list[str] = []
-    topics = survey_bag(recording, skipped) if recording is not None and not clouds else []
+    topics, images, clouds = _survey(recording, skipped)
+    folder_px = _image_size(images)
     scans = [topic for topic in topics if topic.kind == "scans"]
     groups = _by_camera([topic for topic in topics if topic.kind != "scans"])
     if recording is not None and not clouds:
@@ -132,10 +138,13 @@ def new_profile(
     notes = [*map(_line, topics), *skipped]
     if scans:
         names = ["lidar"] if len(scans) == 1 else [f"lidar_{k + 1}" for k in range(len(scans))]
-        lidars = {name: _lidar(name, model, topic) for name, topic in zip(names, scans, strict=True)}
+        lidars = {
+            name: _lidar(name, model, notes, topic, topic.cloud, topic.topic)
+            for name, topic in zip(names, scans, strict=True)
+        }
     else:
         cloud = read_cloud(clouds[0]) if clouds else None
-        lidars = {"lidar": _lidar("lidar", model, None, cloud, str(clouds[0]) if clouds else "")}
+        lidars = {"lidar": _lidar("lidar", model, notes, None, cloud, str(clouds[0]) if clouds else "")}
         if rings := lidars["lidar"].get("elevations_deg"):
             notes.append(f"lidar: {len(rings)} rings, {lidars['lidar'].get('columns', 'unknown')} columns")
     used = {block["frame"] for block in lidars.values()}
@@ -171,23 +180,66 @@ def new_profile(
     return "\n".join(lines) + "\n", notes
 
 
+def _survey(recording: Path | None, skipped: list[str]) -> tuple[list[SensorTopic], list[Path], list[Path]]:
+    """List the topics of a bag, or the images and point clouds of a folder; add topics that are skipped.
+
+    Raises:
+        SourceError: nothing is there that describes a rig's sensors.
+    """
+    if recording is None:
+        return [], [], []
+    kind = recognise(recording)
+    if kind == "folder":
+        bags = [entry for entry in sorted(recording.iterdir()) if entry.is_dir() and kind_of(entry) == ".bag"]
+        if len(bags) != 1:
+            return [], *list_files(recording)
+        recording = bags[0]
+    elif kind not in BAGS:
+        raise SourceError(f"{recording}: a {kind} file does not describe the rig's sensors", _NUMBERS_HINT)
+    return survey_bag(recording, skipped), [], []
+
+
 def _lidar(
-    name: str, model: str, topic: SensorTopic | None, cloud: NDArray[Any] | None = None, where: str = ""
+    name: str,
+    model: str,
+    notes: list[str],
+    topic: SensorTopic | None,
+    cloud: NDArray[Any] | None,
+    where: str,
 ) -> dict[str, Any]:
-    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows."""
+    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows.
+
+    Args:
+        name: of the LiDAR.
+        model: as it was named.
+        notes: receives in what the cloud's rings differ from the model's.
+        topic: that the cloud is from; None without a bag.
+        cloud: one scan; None where there is none.
+        where: file or topic, for messages.
+    """
     block: dict[str, Any] = {"model": model, "frame": f"{name}_link"}
+    sheet = find_data_sheet(model)
+    settings = LidarSettings.model_validate({"model": model})
     if topic is not None:
         block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
         rate_hz = round(topic.rate_hz or 0.0, 1)
-        # Single scans, seconds apart, say nothing of how fast the LiDAR turns.
-        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ else {}
-        cloud, where = topic.cloud, topic.topic
-    if find_data_sheet(model) is None:
+        # Single scans, seconds apart, say nothing of how fast the LiDAR turns; without rings, scans are
+        # accumulated to the rate of the profile, whatever rate they come at.
+        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ and settings.has_rings else {}
+    if sheet is not None and sheet.has_rings and cloud is not None:
+        try:
+            found = compare_beams(to_scan(cloud, name, settings, where), settings)
+            notes.extend(finding.sentence for finding in found)
+        except SourceError as error:
+            notes.append(error.what)
+    if sheet is None:
         if cloud is not None:
-            scan = to_scan(cloud, name, LidarSettings.model_validate({"model": model}), where)
+            scan = to_scan(cloud, name, settings, where)
             elevations_deg, columns = measure_beams(scan)
             block["elevations_deg"] = [round(value, 2) for value in elevations_deg]
             block |= {} if columns is None else {"columns": columns}
+            if alike := suggest_models(np.array(elevations_deg)):
+                notes.append(f"{name}: a {' or '.join(alike)} has such rings: name it with --lidar")
         block |= {
             "laser_bias_sigma_m": TYPICAL.laser_bias_sigma_m,
             "range_offset_sigma_m": TYPICAL.range_offset_sigma_m,
@@ -215,17 +267,8 @@ def _camera(
     }
 
 
-def clouds_in(folder: Path) -> list[Path]:
-    """List the point clouds of a folder that holds images and them, by name; empty for any other."""
-    there = (folder / "pcd").iterdir() if (folder / "pcd").is_dir() else ()
-    return sorted(path for path in there if path.suffix in DECODERS)
-
-
 def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
     """Measure a LiDAR's beams in one of its scans.
-
-    A laser h above the frame's origin and inclined by alpha draws the line z = rho tan(alpha) + h over the
-    distance rho from the axis: z / rho is fitted against 1 / rho for each ring.
 
     Args:
         scan: of at least a few metres around, in the LiDAR's own frame.
@@ -234,22 +277,9 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
         The elevation of each ring in deg, from the lowest; firings of each ring per revolution, None where
         too few returns follow each other.
     """
-    rho = np.hypot(scan.points[:, 0], scan.points[:, 1]).astype(np.float64)
-    x, y = 1 / rho, scan.points[:, 2] / rho
-    elevations = []
-    for ring in np.unique(scan.ring):
-        mine = scan.ring == ring
-        # Fit twice: returns of foreign rings and of edges are few, but far off.
-        for _ in range(2):
-            dx, dy = x[mine] - x[mine].mean(), y[mine] - y[mine].mean()
-            height_m = float(np.clip((dx @ dy) / (dx @ dx + _HEIGHT_PRIOR * mine.sum()), -0.05, 0.05))
-            slope = float(np.median(y[mine] - height_m * x[mine]))
-            mine = mine & (np.abs(y - height_m * x - slope) < 0.01)
-            if not mine.any():
-                break
-        elevations.append(float(np.degrees(np.arctan(slope))))
+    elevations = measure_elevations(scan)
     step_rad = order_scan(scan, min_range_m=0.3).step_rad
-    return sorted(elevations), round(2 * np.pi / step_rad) if step_rad > 0 else None
+    return sorted(elevations.tolist()), round(2 * np.pi / step_rad) if step_rad > 0 else None
 
 
 def parse_board(text: str) -> Board:
@@ -353,9 +383,9 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
     )
 
 
-def _image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) of a folder's first sound image; None without one."""
-    for path in sorted(path for path in folder.glob("img/**/*.*") if path.suffix.lower() in SUFFIXES):
+def _image_size(images: Sequence[Path]) -> tuple[int, int] | None:
+    """Return the width and height (px) of the first sound image; None without one."""
+    for path in images:
         with suppress(SourceError):
             height, width = read_image(path).shape[:2]
             return width, height

@@ -92,7 +92,11 @@ def read_profile(path: Path) -> str:
         ProfileError: it cannot be read, or is not text.
     """
     with reading(path, ProfileError):
-        return path.read_text(encoding="utf-8")
+        try:
+            return path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            hint = "Give the YAML file of a rig; recordings are given with --from."
+            raise ProfileError(f"{path}: it is no profile, as it is not text", hint) from None
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:

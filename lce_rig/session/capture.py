@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError, reading
-from lce_rig.core.files import decode_events, decode_pcd, decode_pixels, encode_events, encode_pcd
+from lce_rig.core.files import decode_events, decode_pixels, encode_events
+from lce_rig.core.pcd import decode_pcd, encode_pcd
 from lce_rig.rig import Rig
 from lce_rig.rig.settings import Name
 from lce_rig.session.durable import flush_folder, write_new_file

@@ -11,9 +11,9 @@ from lce_rig.calibrate import CalibrateOptions, EstimateSettings, error_to_refer
 from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.calibration import Method
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, exp_so3, invert, pose
+from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.results import Observation
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import find_image_board

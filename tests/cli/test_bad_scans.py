@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 from lce_rig.cli.main import run
-from lce_rig.core.files import encode_pcd
 from lce_rig.core.geometry import difference, pose
+from lce_rig.core.pcd import encode_pcd
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import dump_rig, load_rig
 from lce_rig.session import Session

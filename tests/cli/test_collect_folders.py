@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.core.files import encode_pcd
+from lce_rig.core.pcd import encode_pcd
 
 TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
 
@@ -76,3 +76,29 @@ def test_a_session_continues_with_its_own_profile(lce_rig, folders, tmp_path):
     assert lce_rig("collect", "--rig", TWO, *first, session).code == 0
     assert lce_rig("collect", session, "--from", folders[1], "--camera", "right").code == 0
     assert cameras_held(session) == [("left", 100), ("right", 101)]
+
+
+@pytest.mark.parametrize(
+    ("images", "clouds"),
+    [
+        ("img/0.png", "velodyne/0.PCD"),
+        ("Images/0.PNG", "lidar/0.pcd"),
+        ("image_raw/0.png", "scans/0.pcd"),
+        ("img/1635412345.120.png", "pcd/1635412345.123.pcd"),
+        ("0.png", "0.pcd"),
+    ],
+)
+def test_rigs_new_and_collect_know_the_same_folders(lce_rig, folders, tmp_path, images, clouds):
+    folder, source = tmp_path / "data", folders[0]
+    for name, file in ((images, "img/0.png"), (clouds, "pcd/0.pcd")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes((source / file).read_bytes())
+    rig, board = tmp_path / "mine.yaml", "8x6,0.07,0.767x0.626"
+    words = ["rigs", "new", "mine", "-o", rig, "--lidar", "VLP-16", "--from", folder, "--board", board]
+    missing = lce_rig(*words)
+    assert missing.code == 2 and "radtan,1280x720,1024,1024,640,360,0,0,0,0" in missing.err
+    made = lce_rig(*words, "--intrinsics", "radtan,1280x720,1024,1024,640,360,0,0,0,0")
+    assert made.code == 0, made.err
+    collected = lce_rig("collect", "--rig", rig, tmp_path / "session", "--from", folder)
+    assert collected.code == 0, collected.err
+    assert cameras_held(tmp_path / "session") == [("cam", 100)]

@@ -94,6 +94,8 @@ def test_a_profile_of_ones_own_sensors_takes_one_command(capsys, tmp_path):
         (["mine", "--from", "missing.yaml"], 3),
         (["x.yaml"], 2),
         (["x", "--from", "there/is/none.bag", "--board", "8x6,0.07,0.767x0.626"], 5),
+        (["x", "--from", __file__, "--board", "8x6,0.07,0.767x0.626"], 5),
+        (["x", "--from", str(Path(__file__).parent), "--board", "8x6,0.07,0.767x0.626"], 5),
         (["x", "--lidar", "OS1-64", "--board", "8x6,0.07,0.767x0.626"], 2),
         (["x", "--from", "rlfs", "--lidar", "OS1-64"], 2),
         (["x", "--intrinsics", "radtan,64x48,50,50,32,24", "--board", "8x6,0.07,0.767x0.626,2,0"], 3),

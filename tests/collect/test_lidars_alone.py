@@ -12,8 +12,8 @@ from lce_rig.collect.offline import collect
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.files import encode_pcd
 from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.core.pcd import encode_pcd
 from lce_rig.io import open_recording
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig

@@ -13,7 +13,7 @@ import pytest
 
 from lce_rig.collect.offline import collect
 from lce_rig.core.errors import SourceError
-from lce_rig.core.files import encode_pcd
+from lce_rig.core.pcd import encode_pcd
 from lce_rig.detect.finder import BoardFinder, check_origin
 from lce_rig.io import open_recording
 from lce_rig.rig import load_rig

@@ -1,75 +1,12 @@
 """Files of samples: exact there and back; damaged ones say what is wrong with them."""
 
-import struct
-from contextlib import suppress
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events
-from lce_rig.core.errors import SourceError, reading
-from lce_rig.core.files import decode_events, decode_pcd, encode_events, encode_pcd, parse_json
-from tests.damage import damaged
-
-MATLAB = b"""# This PCD file was generated using the MATLAB\xae pcwrite function
-# .PCD v.7 - Point Cloud Data file format
-VERSION .7
-FIELDS x y z intensity
-SIZE 4 4 4 4
-TYPE F F F F
-COUNT 1 1 1 1
-WIDTH 2
-HEIGHT 1
-VIEWPOINT 0 0 0 1 0 0 0
-POINTS 2
-DATA binary
-"""
-CLOUD = np.array([(1.5, -2, 4), (3, 4, 5)], dtype=[("x", "<f4"), ("t", "<f8"), ("ring", "<u2")])
-HEAD = "VERSION 0.7\nFIELDS x t ring\nSIZE 4 8 2\nTYPE F F U\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA "
-# LZF without anything compressed: one literal run of at most 32 bytes.
-PACKED = bytes([27]) + b"".join(CLOUD[name].tobytes() for name in CLOUD.dtype.names or ())
-BODIES = {
-    "ascii": b"1.5 -2 4\n3 4 5\n",
-    "binary": CLOUD.tobytes(),
-    "binary_compressed": struct.pack("<II", len(PACKED), 28) + PACKED,
-}
-
-
-@pytest.mark.parametrize("encoding", BODIES)
-def test_clouds_of_every_encoding_are_read_exactly(encoding):
-    read = decode_pcd(f"{HEAD}{encoding}\n".encode() + BODIES[encoding])
-    assert read.dtype.names == CLOUD.dtype.names
-    assert read.tolist() == CLOUD.tolist() == decode_pcd(encode_pcd(read, ["made here"])).tolist()
-
-
-@pytest.mark.parametrize("encoding", BODIES)
-@given(data=st.data())
-def test_damaged_clouds_are_read_or_refused(encoding, data):
-    with suppress(SourceError), reading("a.pcd"):
-        assert decode_pcd(data.draw(damaged(f"{HEAD}{encoding}\n".encode() + BODIES[encoding]))).dtype.names
-
-
-@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_headers_as_matlab_writes_them_are_read(end):
-    read = decode_pcd(MATLAB.replace(b"\n", end) + np.arange(8, dtype="<f4").tobytes())
-    assert read["intensity"].tolist() == [3.0, 7.0]
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"PK\x03\x04" * 50,
-        MATLAB + bytes(16),
-        MATLAB.replace(b"DATA binary", b"DATA ascii") + b"1 2 3 4\n5 6 7\n",
-        MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 31),
-    ],
-)
-def test_missing_points_are_an_error(data):
-    with pytest.raises(SourceError), reading("a.pcd"):
-        decode_pcd(data)
+from lce_rig.core.files import decode_events, encode_events, parse_json
 
 
 def events_at(t_ns, host_ns=None):

@@ -12,9 +12,9 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
-from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import invert, pose
+from lce_rig.core.pcd import decode_pcd
 from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board
 from lce_rig.io.cloud import rings_from_elevation
 

@@ -166,20 +166,23 @@ def test_lines_that_are_no_rings_are_read_where_the_model_has_none_and_else_refu
 
 
 def test_rings_in_a_tilted_frame_stay_rings(room):
-    tilt = np.radians(10.0)
+    room, tilt = room.copy(), np.radians(10.0)
     x, z = room["x"].copy(), room["z"].copy()
     room["x"], room["z"] = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
     assert len(np.unique(reading_of(room, "lidar", FIRST, "tilted").scan.ring)) == 16
 
 
-def test_more_rings_than_the_model_has_are_reported(room):
-    assert reading_of(room, "lidar", FIRST, "here").notes == ()
-    cloud = np.concatenate([room, room])
-    cloud["ring"][len(room) :] += 16
-    cloud["z"][len(room) :] += 2.0 * np.hypot(room["x"], room["y"])
-    assert has_note(
-        reading_of(cloud, "lidar", FIRST, "here").notes, "32 rings", "VLP-16", "lidars.lidar.model"
-    )
+def test_to_scan_near_returns_judge_no_rings(room):
+    rng = np.random.default_rng(0)
+    mount = room[rng.integers(0, len(room), 4000)]
+    for axis in "xyz":
+        mount[axis] = rng.uniform(-0.2, 0.2, len(mount))
+    for cloud in (np.concatenate([room, mount]), drop_fields(np.concatenate([room, mount]), "ring")):
+        scan = reading_of(cloud, "lidar", FIRST, "here").scan
+        assert len(np.unique(scan.ring)) == 16
+        assert np.linalg.norm(scan.points, axis=1).min() >= FIRST.min_range_m
+    with pytest.raises(SourceError, match=r"nearer than min_range_m 0\.4 m"):
+        to_scan(mount, "lidar", FIRST, "here")
 
 
 VLP16_DEG = np.arange(-15.0, 16.0, 2.0)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
-from lce_rig.core.files import encode_pcd
+from lce_rig.core.pcd import encode_pcd
 from lce_rig.io.decoding import decode_ply, read_cloud, read_image, to_8_bit
 from tests.damage import damaged
 

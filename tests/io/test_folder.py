@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
-from lce_rig.core.files import encode_pcd
+from lce_rig.core.pcd import encode_pcd
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.folder import pair_names, parse_times
 from lce_rig.rig import load_rig

@@ -119,7 +119,8 @@ def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rles):
     ("after_s", "words"),
     [
         (1264.5, ["channels.events.timestamps.expected_offset_s", "-1264.5 s"]),
-        (-1_699_999_999.0, ["one computer's"]),
+        (-1_699_999_999.0, ["counts from its start", "channels.events.timestamps.expected_offset_s"]),
+        (400_000.0, ["one computer's"]),
     ],
 )
 def test_clocks_that_do_not_overlap_are_said_by_how_much(rles, after_s, words):

@@ -339,3 +339,37 @@ def test_long_bags_are_streamed(tmp_path, rig, write_bag, room, cloud_message, i
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert n == 61 and peak < 12 * pixels.nbytes
+
+
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("form", ["folder", "no_metadata", "file", "upper_case"])
+def test_open_recording_compressed_bag_in_any_form(tmp_path, rig, write_bag, stream, mode, kind, form):
+    folder = write_bag(tmp_path / "bag", kind, stream(3), mode)
+    path = next(file for file in folder.iterdir() if file.name != "metadata.yaml")
+    if form == "no_metadata":
+        (folder / "metadata.yaml").unlink()
+    elif form == "upper_case":
+        path = path.rename(tmp_path / path.name.upper())
+    images, scans = read(open_recording(path if form in ("file", "upper_case") else folder, rig))
+    assert (len(images), len(scans)) == (3, 3)
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.bag.active", "a.db3", "a.mcap", "a.db3.zstd", "a.mcap.zst"])
+@pytest.mark.parametrize("content", [b"", b"\xb5\x00\xff" * 99, b"a: [b"])
+def test_open_recording_no_bag_is_named_without_codecs(tmp_path, rig, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SourceError, match=r"content is not that of|not compressed by zstd") as caught:
+        open_recording(tmp_path / name, rig)
+    assert not {"codec", "YAML", "Error"} & set(str(caught.value).split())
+
+
+def test_open_recording_unclosed_bag_names_reindex(tmp_path, rig, write_bag, stream):
+    whole = write_bag(tmp_path / "bag", "ros1", stream(9))
+    path = tmp_path / "drive.bag.active"
+    path.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    with pytest.raises(SourceError) as caught:
+        open_recording(path, rig)
+    assert "rosbag reindex drive.bag.active" in caught.value.hint
+    path.write_bytes(whole.read_bytes())
+    assert len(read(open_recording(path, rig))[0]) == 9

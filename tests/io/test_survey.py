@@ -171,3 +171,16 @@ def test_survey_computed_images_are_no_second_camera(tmp_path, write_bag, image_
     found = survey_bag(write_bag(tmp_path / "bag", "ros1", sent), skipped)
     assert [topic.topic for topic in found] == ["/a/image_raw", "/b/image_rect"]
     assert skipped[1] == "/a/image_rect_color: skipped, it is computed from /a/image_raw"
+
+
+@pytest.mark.parametrize(("model", "rate_hz"), [("Mid-360", 1.0), ("unstructured", 1.0), ("VLP-16", 10.0)])
+def test_new_profile_rate_is_written_for_rings_only(
+    tmp_path, write_bag, room, cloud_message, image_message, model, rate_hz
+):
+    sent = [each for each in messages(room, cloud_message, image_message) if "rear" not in each[0]]
+    bag = write_bag(tmp_path / "bag", "mcap", sent)
+    lens = parse_intrinsics("radtan,64x48,50,50,32,24,0,0,0,0")
+    board = parse_board("8x6,0.07,0.767x0.626")
+    text, _ = new_profile("a", board, recording=bag, lidar_model=model, intrinsics=[lens])
+    assert parse_rig(text).lidars["lidar"].rate_hz == rate_hz
+    assert ("rate_hz" in text) == (rate_hz == 10.0)

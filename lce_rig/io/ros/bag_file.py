@@ -4,16 +4,25 @@ rosbags' readers of single files are used, not its AnyReader: that one parses ev
 bag, and refuses the whole bag for one that it cannot parse or for older bags without any.
 """
 
+import shutil
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from heapq import merge
+from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from lce_rig.core.errors import SourceError, reading, reason_of
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MAX_LISTED = 40
+# Endings that a recorder adds: compressed files, and those of ROS 1 that it did not close.
+_COMPRESSED = (".zstd", ".zst")
+_ADDED = (*_COMPRESSED, ".active")
+_MAGIC = {".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0", ".mcap": b"\x89MCAP0\r\n"}
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 class RawMessage(NamedTuple):
@@ -52,7 +61,7 @@ class BagFile:
         self.path = path
         self.topics: dict[str, tuple[str, int]] = {}
         self.damages: list[SourceError] = []
-        self.files = sorted(file for file in path.iterdir() if is_bag_file(file)) if path.is_dir() else [path]
+        self.files = _bag_files(path) if path.is_dir() else [path]
         self.end_ns = 0
         with self._readers() as readers:
             for reader in readers:
@@ -78,9 +87,12 @@ class BagFile:
                     passes += [reader.messages(wanted)] if wanted else []
                 for connection, log_ns, data in merge(*passes, key=lambda entry: int(entry[1])):
                     encoding = getattr(connection.ext, "serialization_format", "ros1")
-                    yield RawMessage(
-                        connection.topic, _type_of(connection), encoding, int(log_ns), bytes(data)
-                    )
+                    data = bytes(data)
+                    # Without its metadata.yaml a bag does not say that each message is compressed; CDR begins
+                    # with a zero.
+                    if encoding != "ros1" and data.startswith(_ZSTD_MAGIC):
+                        data = _zstd().decompress(data)
+                    yield RawMessage(connection.topic, _type_of(connection), encoding, int(log_ns), data)
                     n_read += 1
             except Exception as error:
                 raise SourceError(
@@ -106,24 +118,62 @@ class BagFile:
                     with reading(file, hint=_repair(file)):
                         if not (is_described or file.is_file()):
                             raise ValueError("it is not a file")
-                        reader = Ros1Reader(file) if file.suffix.lower() == ".bag" else Ros2Reader(file)
+                        plain = file if is_described else stack.enter_context(_plain(file))
+                        is_ros1 = not is_described and kind_of(file) == ".bag"
+                        reader = Ros1Reader(plain) if is_ros1 else Ros2Reader(plain)
                         readers.append(stack.enter_context(reader))
                 except SourceError as error:
                     self.damages.append(error)
             yield readers
 
 
-def is_bag_file(path: Path) -> bool:
-    """Return whether a file's name is that of a bag."""
-    return path.suffix.lower() in SUFFIXES
-
-
 def kind_of(path: Path) -> str:
-    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder"."""
+    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
+
+    The suffix is in lower case, and that of the bag for a compressed one or one that was not closed.
+    """
     if not path.is_dir():
-        return path.suffix.lower()
-    is_bag = (path / "metadata.yaml").is_file() or any(is_bag_file(file) for file in path.iterdir())
-    return ".bag" if is_bag else "folder"
+        name = path.name.lower()
+        for added in _ADDED:
+            if Path(name.removesuffix(added)).suffix in SUFFIXES:
+                name = name.removesuffix(added)
+        return Path(name).suffix
+    return ".bag" if (path / "metadata.yaml").is_file() or _bag_files(path) else "folder"
+
+
+def _bag_files(folder: Path) -> list[Path]:
+    """List the files of a bag in a folder, without those that lie there decompressed, too."""
+    files = sorted(file for file in folder.iterdir() if not file.is_dir() and kind_of(file) in SUFFIXES)
+    return [file for file in files if file.with_suffix("") not in files]
+
+
+@contextmanager
+def _plain(file: Path) -> Iterator[Path]:
+    """Give a file as rosbags knows it: decompressed, its suffix in lower case.
+
+    Raises:
+        ValueError: it is no bag of its kind.
+    """
+    kind = kind_of(file)
+    with TemporaryDirectory() as folder:
+        plain = Path(folder) / f"bag{kind}"
+        if file.suffix.lower() in _COMPRESSED:
+            try:
+                with _zstd().open(file, "rb") as compressed, plain.open("wb") as target:
+                    shutil.copyfileobj(compressed, target)
+            except (_zstd().ZstdError, EOFError):
+                raise ValueError("it is truncated, or not compressed by zstd") from None
+        else:
+            plain.symlink_to(file.resolve())
+        with plain.open("rb") as opened:
+            if not opened.read(16).startswith(_MAGIC[kind]):
+                raise ValueError(f"its content is not that of a {kind} file")
+        yield plain
+
+
+def _zstd() -> Any:
+    """Import the module of which rosbags requires the same."""
+    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
 def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
@@ -144,6 +194,6 @@ def _type_of(connection: Any) -> str:
 def _repair(path: Path) -> str:
     """Name the tool that restores the index of a bag whose recorder was killed."""
     commands = {".bag": f"rosbag reindex {path.name}", ".mcap": f"mcap recover {path.name}"}
-    folder = path if path.is_dir() else path.parent
-    command = commands.get(path.suffix.lower(), f"ros2 bag reindex {folder.name}")
+    folder = (path if path.is_dir() else path.parent).resolve()
+    command = commands.get(kind_of(path), f"ros2 bag reindex {folder.name}")
     return f"If its recorder was killed, repair it: {command}"

@@ -1,6 +1,8 @@
 """A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,12 @@ from lce_rig.io.ros.messages import (
     deserialize,
     header_stamp_ns,
 )
+from lce_rig.io.ros.receipt_clock import describe, find_foreign, fit_to_receipts
 from lce_rig.io.ros.topics import PACKET_TYPES, Target, choose_topics
 from lce_rig.io.velodyne_scans import OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.scan_pairing import rig_offset_ns
 
 # Scans come by this share of the period too early, at most.
 _EARLY = 0.05
@@ -38,6 +43,7 @@ class TopicDecoder:
     Args:
         target: the sensor it belongs to.
         settings: that sensor's block of the profile.
+        clock: from the timestamps' clock to the recorder's; None where they are one.
 
     Attributes:
         n_yielded: samples so far.
@@ -46,12 +52,17 @@ class TopicDecoder:
         hint: an action against the failure of the last message that could not be decoded.
     """
 
-    def __init__(self, target: Target, settings: CameraSettings | LidarSettings) -> None:
+    def __init__(
+        self,
+        target: Target,
+        settings: CameraSettings | LidarSettings,
+        clock: ClockModel | None = None,
+    ) -> None:
         self.n_yielded = 0
         self.losses = Losses()
         self.notes: set[str] = set()
         self.hint = ""
-        self._target, self._settings = target, settings
+        self._target, self._settings, self._clock = target, settings, clock
         self._last_ns: int | None = None
         self._packets: Vlp16Stream | None = None
         self._parts: list[Scan] = []
@@ -63,7 +74,10 @@ class TopicDecoder:
             if message.msgtype in PACKET_TYPES:
                 samples += self._assemble(content)
             else:
-                samples.append(self._to_sample(message, content))
+                sample = self._to_sample(message, content)
+                if self._clock is not None and sample.stamp_ns is not None:
+                    sample = replace(sample, stamp_ns=self._clock.convert(sample.stamp_ns))
+                samples.append(sample)
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
             self.hint = error.hint if isinstance(error, SourceError) else ""
@@ -217,9 +231,10 @@ class BagRecording:
     def _messages(self) -> Iterator[Sample]:
         """Yield images and scans."""
         decoders: dict[str, TopicDecoder] = {}
+        clocks = self._fit_clocks()
         for topic, target in self._targets.items():
             sensors = self._rig.lidars if target.channel is None else self._rig.cameras
-            decoders[topic] = TopicDecoder(target, sensors[target.sensor])
+            decoders[topic] = TopicDecoder(target, sensors[target.sensor], clocks.get(topic))
         try:
             for message in self._bag.messages(self._targets.keys()):
                 yield from decoders[message.topic].decode(message)
@@ -234,6 +249,31 @@ class BagRecording:
                 failed = losses.get(findings.NOT_DECODED.code)
                 cause = failed.figures["where"] if failed else "its timestamps do not increase"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
+
+    def _fit_clocks(self) -> dict[str, ClockModel]:
+        """Fit the clocks of sensors that are not the others', by topic; note each.
+
+        The profile's `expected_offset_s` comes first, and packets bring their arrivals.
+        """
+        topics = {
+            topic: target
+            for topic, target in self._targets.items()
+            if self._bag.topics[topic][0] not in PACKET_TYPES
+            and not rig_offset_ns(target.stream(self._bag.topics[topic][0]), self._rig)
+        }
+        has_host = len(topics) < len(self._targets) or bool(self._events)
+        clocks: dict[str, ClockModel] = {}
+        # A bag that cannot be read to its end is read as far as it goes, and its damage reported, later.
+        with suppress(SourceError):
+            for topic in find_foreign(self._bag, topics, has_host=has_host):
+                target = topics[topic]
+                lidar = self._rig.lidars[target.sensor] if target.channel is None else None
+                is_sent_after = lidar is not None and lidar.timestamps.reference == "first_firing"
+                clock = fit_to_receipts(self._bag, topic, is_sent_after=is_sent_after)
+                if clock is not None:
+                    clocks[topic] = clock
+                    self.notes.append(f"{topic}: {describe(str(target), clock).sentence}")
+        return clocks
 
     def _open_events(self) -> dict[Stream, EventRecording]:
         """Take the topics of raw events out of the others and open them.
