@@ -5,15 +5,17 @@ Fisher scoring: Gauss-Newton on ranges and images, mean information and score fo
 (restricted maximum likelihood), so that residuals reduced by the fit are not mistaken for small noise.
 """
 
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
-from lce_rig.calibrate.likelihood.layout import Indices, State
+from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
@@ -46,9 +48,59 @@ _DIVERGED = 1e12
 # Largest ratio of a mixed step's length to the plain one's.
 _LONGEST = 5.0
 
+AnyTerms = TypeVar("AnyTerms")
+
+
+class Optimum(ABC):
+    """Covariance of the G unknowns z that captures share, by cause."""
+
+    @property
+    @abstractmethod
+    def cost(self) -> Quadratics:
+        """Of the F captures, in z."""
+
+    @property
+    @abstractmethod
+    def profiled(self) -> Mapping[str, tuple[Indices, float]]:
+        """Places in z and standard deviation of each error of lens and board, by name."""
+
+    @cached_property
+    def covariances(self) -> tuple[Array, Array]:
+        """Parts (G, G) of the covariance of z: noise of the session, and errors of the LiDARs.
+
+        With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + sum_i H^-1 P_i H^-1, with the
+        priors P_i of each kind of constant error. `moves` holds those of lens and board.
+        """
+        inverse, prior = self.cost.covariance(), self.cost.prior.copy()
+        for at, _ in self.profiled.values():
+            prior[at] = 0.0
+        return inverse @ self.cost.hessians.sum(axis=0) @ inverse, inverse @ prior @ inverse
+
+    @cached_property
+    def moves(self) -> dict[str, Array]:
+        """Changes (G, n) of z by n independent errors of lens and board, of one standard deviation each.
+
+        An error of the profile moves z by H^-1 P_i for each unit. Unknowns c that are held move the others by
+        -H^-1 sum_k H_k,c.
+        """
+        inverse, data, found = self.cost.covariance(), self.cost.hessians.sum(axis=0), {}
+        for name, (at, sigma) in self.profiled.items():
+            if name in _HELD:
+                moves = -inverse @ data[:, at]
+                moves[at] = np.eye(len(at))
+            else:
+                moves = inverse @ self.cost.prior[:, at]
+            found[name] = sigma * moves
+        return found
+
+    @cached_property
+    def cov_z(self) -> Array:
+        """(G, G) of z."""
+        return np.asarray(sum(self.covariances) + sum(m @ m.T for m in self.moves.values()))
+
 
 @dataclass(frozen=True, eq=False)
-class JointEstimate:
+class JointEstimate(Optimum):
     """The optimum, with G unknowns z that the captures share.
 
     Attributes:
@@ -80,54 +132,10 @@ class JointEstimate:
         """Of the F captures, in z."""
         return replace(self.reduced.cost, placement=self.placement)
 
-    @cached_property
-    def covariances(self) -> tuple[Array, Array]:
-        """Parts (G, G) of the covariance of z: noise of the session, and errors of the LiDAR.
-
-        With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + sum_i H^-1 P_i H^-1, with the
-        priors P_i of each kind of constant error. `moves` holds those of lens and board.
-        """
-        inverse, prior = self.cost.covariance(), self.cost.prior.copy()
-        for at, _ in self._profiled.values():
-            prior[at] = 0.0
-        return inverse @ self.cost.hessians.sum(axis=0) @ inverse, inverse @ prior @ inverse
-
-    @cached_property
-    def moves(self) -> dict[str, Array]:
-        """Changes (G, n) of z by n independent errors of lens and board, of one standard deviation each.
-
-        An error of the profile moves z by H^-1 P_i for each unit. Unknowns c that are held move the others by
-        -H^-1 sum_k H_k,c.
-        """
-        inverse, data, found = self.cost.covariance(), self.cost.hessians.sum(axis=0), {}
-        for name, (at, sigma) in self._profiled.items():
-            if name in _HELD:
-                moves = -inverse @ data[:, at]
-                moves[at] = np.eye(len(at))
-            else:
-                moves = inverse @ self.cost.prior[:, at]
-            found[name] = sigma * moves
-        return found
-
     @property
-    def _profiled(self) -> dict[str, tuple[Indices, float]]:
+    def profiled(self) -> Mapping[str, tuple[Indices, float]]:
         """Places in z and standard deviation of each error of lens and board, by name."""
-        layout, priors = self.state.layout, self.priors
-        found = {
-            "plate_size": (layout.plate, priors.plate_m),
-            "board_bow": (layout.z.of(["bow"]), priors.bow_m),
-        }
-        if layout.n_cameras:
-            optics = np.concatenate([layout.optics(c) for c in range(layout.n_cameras)])
-            found["square_size"] = layout.z.of(["squares"]), priors.squares
-            found["pattern_offset"] = layout.z.of(["pattern"]), priors.pattern_m
-            found["intrinsics"] = optics, priors.optics
-        return found
-
-    @cached_property
-    def cov_z(self) -> Array:
-        """(G, G) of z."""
-        return np.asarray(sum(self.covariances) + sum(m @ m.T for m in self.moves.values()))
+        return profiled(self.state.layout, self.priors)
 
     @cached_property
     def to_extrinsics(self) -> Array:
@@ -149,6 +157,20 @@ class JointEstimate:
         """(C, 6, 6) of each, everything else marginalised, tangent (translation m, rotation rad)."""
         J = self.to_extrinsics
         return np.asarray(J @ self.cov_z @ np.swapaxes(J, 1, 2))
+
+
+def profiled(layout: Layout, priors: Priors) -> dict[str, tuple[Indices, float]]:
+    """List the places in z and the standard deviation of each error of lens and board, by name."""
+    found = {
+        "plate_size": (layout.plate, priors.plate_m),
+        "board_bow": (layout.z.of(["bow"]), priors.bow_m),
+    }
+    if layout.n_cameras:
+        optics = np.concatenate([layout.optics(c) for c in range(layout.n_cameras)])
+        found["square_size"] = layout.z.of(["squares"]), priors.squares
+        found["pattern_offset"] = layout.z.of(["pattern"]), priors.pattern_m
+        found["intrinsics"] = optics, priors.optics
+    return found
 
 
 def maximise_likelihood(
@@ -250,13 +272,38 @@ def approach(terms: Terms, levels: Levels, priors: Priors) -> Terms:
 
 
 def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
-    """Find the optimum at given levels in at most `n_steps` steps, until the next one is short.
+    """Find the optimum at given levels in at most `n_steps` steps, until the next one is short."""
+
+    def reduce(here: Terms) -> Reduced:
+        return assemble(here, levels, priors)
+
+    def move(here: Terms, z: Array, y: Array) -> Terms:
+        return linearise(here.scans, here.images, here.board, here.state.moved(z, y), here.trust)
+
+    return descend(terms, reduce, move, n_steps, short)
+
+
+def descend(
+    terms: AnyTerms,
+    reduce: Callable[[AnyTerms], Reduced],
+    move: Callable[[AnyTerms, Array, Array], AnyTerms],
+    n_steps: int,
+    short: float,
+) -> AnyTerms:
+    """Find the optimum of linearised terms in at most `n_steps` steps, until the next one is short.
 
     The mean information of ring ends is not the curvature of their cost: plain steps are five times too short
     in some directions and oscillate in others. Anderson mixing corrects them by the effect of earlier steps.
     From steps s_k and moves m_k,
 
         m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
+
+    Args:
+        terms: to start from.
+        reduce: gives the normal equations of terms.
+        move: linearises terms anew after a step z (G,) and y (F, n).
+        n_steps, short: maximum number of steps; length of the next one that ends them, in standard
+            deviations of all unknowns.
 
     References:
         Walker, Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numerical Analysis, 2011.
@@ -265,7 +312,7 @@ def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: fl
     moves: list[Array] = []
     finite = terms
     for _ in range(n_steps):
-        reduced = assemble(terms, levels, priors)
+        reduced = reduce(terms)
         # Far from any optimum steps may diverge: keep the last finite terms.
         if not reduced.decrement < _DIVERGED:
             return finite
@@ -273,20 +320,20 @@ def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: fl
         if reduced.decrement < short**2:
             break
         z, y = reduced.step
-        move = step = np.append(z, y)
+        step = np.append(z, y)
         steps.append(step)
+        mixed = step
         if len(steps) > _PLAIN:
             of_own = np.diagonal(reduced.of_own, axis1=1, axis2=2)
             weight = np.sqrt(np.append(np.diag(reduced.cost.information), of_own))
             dS = np.diff(steps[-_MIXED - 1 :], axis=0).T
             dM = np.transpose(moves[-dS.shape[1] :])
             gamma = np.linalg.lstsq(weight[:, None] * dS, weight * step, rcond=1e-6)[0]
-            move = step - (dM + dS) @ gamma
-            length, plain = (float(np.linalg.norm(weight * each)) for each in (move, step))
-            move = move * min(1.0, _LONGEST * plain / max(length, np.finfo(float).tiny))
-        moves.append(move)
-        state = terms.state.moved(move[: len(z)], move[len(z) :].reshape(y.shape))
-        terms = linearise(terms.scans, terms.images, terms.board, state, terms.trust)
+            mixed = step - (dM + dS) @ gamma
+            length, plain = (float(np.linalg.norm(weight * each)) for each in (mixed, step))
+            mixed = mixed * min(1.0, _LONGEST * plain / max(length, np.finfo(float).tiny))
+        moves.append(mixed)
+        terms = move(terms, mixed[: len(z)], mixed[len(z) :].reshape(y.shape))
     return terms
 
 
@@ -357,6 +404,13 @@ def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
 
 
 def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
+    """Weight captures (F,) by their influence on the extrinsics, those of a placement as one."""
+    once = weigh_placements(placement, terms.images)
+    cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
+    return once * by_influence(cost, np.concatenate(extrinsics_by_unknowns(terms)))
+
+
+def by_influence(cost: Quadratics, J: Array) -> Array:
     """Weight captures (F,) by the shift of the extrinsics without them, relative to that expected from noise.
 
     Without placement k the unknowns move by m_k = (H - H_k)^-1 g_k, with the covariance (H - H_k)^-1 - H^-1.
@@ -370,12 +424,13 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     and one of 27 moved the result three and five times as far as expected from noise, the next one less than
     twice.
 
+    Args:
+        cost: of the captures at the optimum, those of a placement with the weight of one.
+        J: (e, G) derivative of the extrinsics.
+
     References:
         Huber, "Robust Statistics", 1981.
     """
-    once = weigh_placements(placement, terms.images)
-    cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
-    J = np.concatenate(extrinsics_by_unknowns(terms))
     H, of_placement = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
     without = symmetric_inverse(H - of_placement)
     moves = (without @ (cost.groups @ cost.gradients)[..., None])[..., 0] @ J.T
@@ -384,7 +439,7 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     squares = np.einsum("gi,ij,gj->g", moves, precision, moves)
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
-    return np.asarray(once * (_HUBER / np.clip(z, _HUBER, _FARTHEST))[placement])
+    return np.asarray((_HUBER / np.clip(z, _HUBER, _FARTHEST))[cost.placement])
 
 
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:

@@ -111,6 +111,20 @@ class Summed(NamedTuple):
     log_volume: float
 
 
+class Known(NamedTuple):
+    """Priors of the G unknowns that captures share.
+
+    Attributes:
+        information: (G, G).
+        off: (G,) distance of the present values from the priors' means.
+        log_volume: log determinant of the covariance.
+    """
+
+    information: Array
+    off: Array
+    log_volume: float
+
+
 Part = Callable[[Terms, Levels], Iterator[Products]]
 
 
@@ -232,8 +246,7 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
         levels: of their noise.
         priors: of the constants.
     """
-    summed = _sum(terms, [each for part in _PARTS for each in part(terms, levels)])
-    return _reduce(terms, summed, levels, priors)
+    return _reduce(terms, sum_products(terms, levels), levels, priors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +286,9 @@ class Evidence:
         reduced = _reduce(terms, summed, levels, priors)
         moments = reduced.second_moments(terms.trust)
         weighted = moments * terms.trust[:, None, None]
-        prior, mean, prior_volume = _prior(terms, levels, priors)
+        known = prior_of(terms, levels, priors)
         # All captures have the same z; the mean of the square of its distance from that of the prior.
-        z = terms.state.z - mean
+        z = known.off
         common = slice(OWN.size, -1)
         shift = np.outer(z, moments[0, common, -1])
         squares = moments[0, common, common] + np.outer(z, z) + shift + shift.T
@@ -284,12 +297,13 @@ class Evidence:
         def change(name: str) -> float:
             there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
             if name == "laser_m":
-                moved_prior, _, log_volume = _prior(terms, there, priors)
-                return float(np.vdot(squares, moved_prior - prior)) + log_volume - prior_volume
+                moved = prior_of(terms, there, priors)
+                by_prior = float(np.vdot(squares, moved.information - known.information))
+                return by_prior + moved.log_volume - known.log_volume
             part, total = part_of[name], 0.0
-            for own, here, moved in zip(felt[part], parts[part], part(terms, there), strict=True):
-                total += float(np.vdot(own, moved.products - here.products))
-                total += float(terms.trust[here.capture] @ (moved.log_volume - here.log_volume))
+            for own, here, after in zip(felt[part], parts[part], part(terms, there), strict=True):
+                total += float(np.vdot(own, after.products - here.products))
+                total += float(terms.trust[here.capture] @ (after.log_volume - here.log_volume))
             return total
 
         slopes = np.array([change(name) for name in self.names]) / _LOG_STEP
@@ -299,6 +313,11 @@ class Evidence:
 def _places(part: Products) -> tuple[Indices, Indices, Indices]:
     """Index the places (n, c, c) of products in matrices (F, n, n) of all unknowns."""
     return part.capture[:, None, None], part.place[:, :, None], part.place[:, None, :]
+
+
+def sum_products(terms: Terms, levels: Levels) -> Summed:
+    """Sum the products of all measurements."""
+    return _sum(terms, [each for part in _PARTS for each in part(terms, levels)])
 
 
 def _sum(terms: Terms, parts: Sequence[Products]) -> Summed:
@@ -315,25 +334,36 @@ def _sum(terms: Terms, parts: Sequence[Products]) -> Summed:
 
 def _reduce(terms: Terms, summed: Summed, levels: Levels, priors: Priors) -> Reduced:
     """Eliminate the captures' own unknowns and add the priors."""
-    (M, log_volume), trust = summed, terms.trust
-    own, common = slice(0, OWN.size), slice(OWN.size, None)
+    return eliminate(summed, terms.trust, OWN.size, prior_of(terms, levels, priors))
+
+
+def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced:
+    """Eliminate the own unknowns of F captures and add what is known of the others.
+
+    Args:
+        summed: products of rows of n_own own unknowns, G others and the residual.
+        trust: (F,) weight of each capture.
+        n_own: number of own unknowns of a capture.
+        known: of the others.
+    """
+    M, log_volume = summed
+    own, common = slice(0, n_own), slice(n_own, None)
     of_own, cross = M[:, own, own], M[:, own, common]
     steps = np.linalg.solve(of_own, cross)
     reduced = M[:, common, common] - np.swapaxes(cross, 1, 2) @ steps
-    prior, mean, prior_volume = _prior(terms, levels, priors)
-    off = terms.state.z - mean
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
+    prior, off = known.information, known.off
     cost = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
     information, gradient = cost.information, gradients.sum(axis=0) + cost.prior_gradient
     least = costs.sum() + off @ cost.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
     likelihood = float(least + log_volume)
     log_volume += float(trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
-    return Reduced(cost, np.asarray(steps), of_own, float(least + log_volume + prior_volume), likelihood)
+    return Reduced(cost, np.asarray(steps), of_own, float(least + log_volume + known.log_volume), likelihood)
 
 
-def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
-    """Build the priors' information (G, G), their mean (G,) and the log of their covariance's determinant.
+def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
+    """Build the priors of the unknowns that captures share.
 
     Range offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """
@@ -366,4 +396,4 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
         cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
         prior[at[:, None], at] = np.linalg.inv(cov)
         log_volume += float(np.linalg.slogdet(cov)[1])
-    return prior, mean, log_volume
+    return Known(prior, terms.state.z - mean, log_volume)
