@@ -1,18 +1,11 @@
-"""The pose of two LiDARs to each other, from boards that both see; no camera takes part.
+"""Two LiDARs that saw the same boards: the captures that agree, and where the estimate of their pose starts.
 
     place_boards      the boards' poses by each LiDAR alone, of maximum likelihood, with its constant errors
     find_consensus    the captures that agree on one rigid transform
-    solve             Algorithm 1: the outliers, and where the estimate starts
-    below             poses of both LiDARs of maximum likelihood
+    solve             Algorithm 1: the outliers, and where the estimate (`rig_estimate`) starts
 
 The first LiDAR takes the camera's place: the boards' poses in its scans are what the poses in images are to
-a camera. Its points keep their errors common to all captures, which the extrinsics share. With T_1 and T_2 a
-board's poses, x the tangent of T_12, e their errors and d the constant errors of unit variance that both
-LiDARs have in all captures,
-
-    log(T_12 T_2 T_1^-1) = A x + B (S_2 d_2 + e_2) - (S_1 d_1 + e_1)                                     (1)
-
-whose squares in units of cov(e_1) + B cov(e_2) B^T are least, with d^2 added.
+a camera.
 
 A plate without print looks the same turned by 180 deg, a square one by 90 deg. Normals and middles of several
 boards decide T_12 without that turn, which then follows by capture.
@@ -31,22 +24,16 @@ from lce_rig.calibrate.likelihood.fit import JointEstimate, fit_boards, maximise
 from lce_rig.calibrate.likelihood.layout import OWN
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.likelihood.rays import lens_fields
-from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
-from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
-from lce_rig.calibrate.uncertainty import widen
+from lce_rig.calibrate.result import Start
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import (
     Array,
-    composition_slopes,
     difference,
     exp_so3,
-    perturb,
     pose,
     rotation_angle,
-    skew,
 )
 from lce_rig.core.results import LidarBoard, Observation
 
@@ -54,16 +41,6 @@ from lce_rig.core.results import LidarBoard, Observation
 _NEARLY_SQUARE = 0.1
 # A board in the two scans may differ by so much about its normal; more is another thing of its size.
 _MOST_TURN_RAD = np.radians(15.0)
-_STEPS = 5
-# Captures farther off than this many standard deviations, or medians of all, count less than in full (Huber).
-_HUBER = 1.5
-# A lens, lateral and vertical, follows from how ring ends shear an oblique plate. Errors of their model that
-# all boards share, and that no scatter shows, displaced it by so much in simulated sessions of an OS1-64.
-_LENS_ERROR_M = np.array([0.0025, 0.0015])
-# Conditions of loops that follow from the other loops.
-_REDUNDANT = 1e-9
-# Constant errors that move no pose by more than this share of the largest are left out.
-_NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,26 +50,31 @@ class PlacedBoards:
     Attributes:
         T: (F, 4, 4) T_lidar_board.
         cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
-        shared: (F, 6, m) tangents by m independent errors of unit variance, common to all captures.
         joint: the estimate they are of.
     """
 
     T: Array
     cov: Array
-    shared: Array
     joint: JointEstimate
 
 
-class PairEstimate(NamedTuple):
-    """Two LiDARs' pose to each other, in an optical frame of the first.
+class LidarPair(NamedTuple):
+    """Two LiDARs, in an optical frame of the first.
 
     Attributes:
-        estimate: of T_optical_second.
+        start: pose of the second by Algorithm 1, with the captures that agree.
+        boards: by capture in both scans.
+        alone: estimate of the boards by each LiDAR alone.
+        joint: of the same boards, with the first LiDAR's poses as if they were images: only to judge whether
+            mountings changed.
         rejected: the other captures in which both see a plate.
         T_view: (4, 4) T_optical_first.
     """
 
-    estimate: CalibrationEstimate
+    start: Start
+    boards: Mapping[str, tuple[LidarBoard, LidarBoard]]
+    alone: tuple[JointEstimate, JointEstimate]
+    joint: JointEstimate
     rejected: Sequence[Observation]
     T_view: Array
 
@@ -106,28 +88,21 @@ def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateS
         settings: what the profile says of this LiDAR.
     """
     joint = fit_boards(lidars, board, *what_is_known(settings))
-    state, reduced, pose_of = joint.state, joint.reduced, OWN["pose"]
-    by_errors = -reduced.own_steps[:, pose_of, :-1]
+    state, pose_of = joint.state, OWN["pose"]
     # The points lie where the driver puts them, displaced by the lens (`likelihood.rays`).
-    T, lens = state.T_lidar_board.copy(), state.layout.z["lens"]
-    fields = lens_fields(T[:, :3, 3])
-    T[:, :3, 3] += fields @ state.z[lens]
-    by_errors[:, :3, lens] += fields
-    shared = by_errors @ np.linalg.cholesky(reduced.cost.covariance())
-    shared = np.concatenate([shared, by_errors[:, :, lens] * _LENS_ERROR_M], axis=2)
-    values, vectors = np.linalg.eigh(np.einsum("fij,fik->jk", shared, shared))
-    kept = vectors[:, values > _NEGLIGIBLE**2 * values[-1]]
-    of_own = np.asarray(np.linalg.inv(reduced.of_own), dtype=np.float64)
-    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept), joint)
+    T = state.T_lidar_board.copy()
+    T[:, :3, 3] += lens_fields(T[:, :3, 3]) @ state.z[state.layout.z["lens"]]
+    of_own = np.asarray(np.linalg.inv(joint.reduced.of_own), dtype=np.float64)
+    return PlacedBoards(T, of_own[:, pose_of, pose_of], joint)
 
 
-def estimate_between_lidars(
+def match_lidars(
     candidates: Sequence[Observation],
     first: Mapping[str, Sequence[LidarBoard]],
     board: Board,
     settings: tuple[EstimateSettings, EstimateSettings],
-) -> PairEstimate:
-    """Estimate the pose of the second LiDAR in an optical frame of the first.
+) -> LidarPair:
+    """Find the captures that agree on the pose of the second LiDAR in an optical frame of the first.
 
     The optical frame has the first LiDAR's origin, z level towards the boards and y down: for all checks,
     the first LiDAR is a camera.
@@ -148,7 +123,7 @@ def estimate_between_lidars(
     one = place_boards([_board_of(o, first[o.capture]) for o in agreed], board, settings[0])
     T_view = optical_frame(one.T[:, :3, 3])
     R = np.kron(np.eye(2), T_view[:3, :3])
-    one = replace(one, T=T_view @ one.T, cov=R @ one.cov @ R.T, shared=R @ one.shared)
+    one = replace(one, T=T_view @ one.T, cov=R @ one.cov @ R.T)
     seen, refused, observations = {}, dict(consensus.refused), []
     for o in candidates:
         if o.capture in refused:
@@ -169,49 +144,16 @@ def estimate_between_lidars(
         )
     start = solve(observations, board)
     start = replace(start, refused=refused | dict(start.refused))
-    used = {o.capture for o in start.observations}
-    is_used = [o.capture in used for o in agreed]
-    one = replace(one, T=one.T[is_used], cov=one.cov[is_used], shared=one.shared[is_used])
-    other = place_boards([o.lidar for o in start.observations], board, settings[1])
-    estimate = _fit_poses(start, one, other, board)
-    return PairEstimate(estimate, [seen[name] for name in sorted(seen.keys() - used)], T_view)
-
-
-def close_loops(edges: Mapping[tuple[str, str], tuple[Array, Array]]) -> dict[tuple[str, str], Array]:
-    """Adjust poses by least squares so that every loop of three sensors closes: T_ab T_bc = T_ac.
-
-        v = -C A^T (A C A^T)^+ r                                                                         (2)
-
-    with r the tangents by which the loops are open, A their derivatives and C the poses' covariances. The
-    estimates share boards. If their errors were those of the boards' poses alone, the loops would be closed
-    and nothing would move; correlation makes r smaller, so that (2) never moves a pose too far.
-
-    Args:
-        edges: T_ab (4, 4) and its covariance (6, 6), by the names of a and b.
-
-    Returns:
-        T_ab of each edge that is part of a loop.
-    """
-    names = sorted(edges)
-    loops = [((a, b), (b, c), (a, c)) for a, b in names for d, c in names if d == b and (a, c) in edges]
-    poses = {name: T for name, (T, _) in edges.items()}
-    start, C = dict(poses), np.zeros((6 * len(names), 6 * len(names)))
-    for k, name in enumerate(names):
-        C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = edges[name][1]
-    for _ in range(_STEPS if loops else 0):
-        A, r = np.zeros((6 * len(loops), len(C))), np.zeros(6 * len(loops))
-        for k, (ab, bc, ac) in enumerate(loops):
-            rows = slice(6 * k, 6 * k + 6)
-            r[rows] = difference(poses[ab] @ poses[bc], poses[ac])
-            slopes = (*composition_slopes(poses[ab], poses[bc]), -np.eye(6))
-            for name, J in zip((ab, bc, ac), slopes, strict=True):
-                place = 6 * names.index(name)
-                A[rows, place : place + 6] += J
-        # The linearised conditions hold for the distance from the estimates, not from the last step.
-        moved = np.concatenate([difference(poses[name], start[name]) for name in names])
-        v = -C @ A.T @ np.linalg.pinv(A @ C @ A.T, rcond=_REDUNDANT, hermitian=True) @ (r - A @ moved)
-        poses = {name: perturb(start[name], v[6 * k : 6 * k + 6]) for k, name in enumerate(names)}
-    return {name: poses[name] for loop in loops for name in loop}
+    used = {o.capture: o.lidar for o in start.observations}
+    other = place_boards(list(used.values()), board, settings[1])
+    boards = {
+        o.capture: (_board_of(o, first[o.capture]), used[o.capture]) for o in agreed if o.capture in used
+    }
+    joint = maximise_likelihood(
+        [start.observations], board, [start.T_cam_lidar], other.joint.priors, other.joint.levels
+    )
+    rejected = [seen[name] for name in sorted(seen.keys() - used.keys())]
+    return LidarPair(start, boards, (one.joint, other.joint), joint, rejected, T_view)
 
 
 def optical_frame(middles: Array) -> Array:
@@ -253,49 +195,3 @@ def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
     turns = pose(exp_so3(steps[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((n_fold, 3)))
     turn = turns[int(np.argmin(rotation_angle(T[:3, :3], (other @ turns)[:, :3, :3])))]
     return turn, abs(float(difference(other @ turn, T)[3:] @ T[:3, 2]))
-
-
-def _fit_poses(start: Start, one: PlacedBoards, other: PlacedBoards, board: Board) -> CalibrationEstimate:
-    """Minimise (1) from Algorithm 1's solution.
-
-    Args:
-        start: with the F captures used.
-        one, other: their boards in both LiDARs.
-        board: the plate.
-    """
-    placement = group_placements(start.observations)
-    once = 1 / np.bincount(placement)[placement]
-    T = start.T_cam_lidar
-    n_one, n_other = one.shared.shape[2], other.shared.shape[2]
-    prior = np.diag(np.r_[np.zeros(6), np.ones(n_one + n_other)])
-    errors = np.zeros(n_one + n_other)
-    for _ in range(_STEPS):
-        R = np.kron(np.eye(2), T[:3, :3])
-        J = np.concatenate([np.zeros((len(one.T), 6, 6)), -one.shared, R @ other.shared], axis=2)
-        J[:, :, :6] = np.eye(6)
-        J[:, :3, 3:6] = -skew(other.T[:, :3, 3] @ T[:3, :3].T)
-        residual = difference(T @ other.T, one.T) + J[:, :, 6:] @ errors
-        information = np.linalg.inv(one.cov + R @ other.cov @ R.T)
-        chi2 = np.einsum("fi,fij,fj->f", residual, information, residual)
-        off = np.sqrt(np.maximum(chi2 / 6, 1e-12))
-        off /= max(float(np.median(off)), 1.0)
-        weighted = (once * np.minimum(1, _HUBER / off))[:, None, None] * np.swapaxes(J, 1, 2) @ information
-        cost = Quadratics(
-            (weighted @ residual[..., None])[..., 0],
-            weighted @ J,
-            prior,
-            prior @ np.r_[np.zeros(6), errors],
-            placement,
-        )
-        step = cost.optimum()
-        T, errors = perturb(T, step[:6]), errors + step[6:]
-    inverse = cost.covariance()
-    scatter = (inverse @ cost.hessians.sum(axis=0) @ inverse)[:6, :6]
-    constants = (inverse @ prior @ inverse)[:6, :6]
-    left_out = jackknife_scatter(cost.moves()[:, :6])
-    cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
-    figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
-    estimate = report(start, T, cov, board, figures)
-    # The same boards as if the first LiDAR's poses were images: only to judge whether mountings changed.
-    joint = maximise_likelihood([start.observations], board, [T], other.joint.priors, other.joint.levels)
-    return replace(estimate, method="ml", joint=(joint, 0))

@@ -8,7 +8,8 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.images import stack_images
-from lce_rig.calibrate.likelihood.layout import SHIFTS
+from lce_rig.calibrate.likelihood.layout import SHIFTS, State
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
 from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
@@ -203,7 +204,9 @@ def by_likelihood(
     J = joint.to_extrinsics[camera]
     scatter, constants = (J @ each @ J.T for each in joint.covariances)
     cov, inflation = widen(scatter + constants, jackknife_scatter(moves), n_placements)
-    figures = _add_figures(start.diagnostics, joint, inflation)
+    shift = joint.state.layout.z["shifts"].start
+    shift_sigma_m = float(np.sqrt(joint.cov_z[shift, shift]))
+    figures = with_errors(start.diagnostics, joint.levels, joint.state, shift_sigma_m, inflation)
     figures = with_parts(figures, scatter, constants)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
     return replace(
@@ -216,22 +219,31 @@ def by_likelihood(
     )
 
 
-def _add_figures(start: Diagnostics, joint: JointEstimate, inflation: float) -> Diagnostics:
-    """Replace the start's constant errors and noise levels by those of a joint estimate."""
-    levels, state = joint.levels, joint.state
+def with_errors(
+    start: Diagnostics, levels: Levels, state: State, edge_shift_sigma_m: float, inflation: float
+) -> Diagnostics:
+    """Replace the start's constant errors and noise levels by those of a joint estimate.
+
+    Args:
+        start: figures of Algorithm 1.
+        levels: of the noise.
+        state: of the LiDAR; with cameras, also of the squares.
+        edge_shift_sigma_m: standard deviation of the edge shift.
+        inflation: of the covariance.
+    """
     shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
     return replace(
         start,
         covariance_inflation=inflation,
         edge_shift_m=shifts["d_0"],
-        edge_shift_sigma_m=float(np.sqrt(np.diag(joint.cov_z)[state.layout.z["shifts"]][0])),
+        edge_shift_sigma_m=edge_shift_sigma_m,
         edge_shift_echo_m=shifts["d_1"],
         edge_shift_blended_m=shifts["d_2"],
         edge_shift_blended_echo_m=shifts["d_3"],
         range_offset_m=float(np.mean(state.lasers[0])),
         laser_spread_m=float(np.std(state.lasers[0])),
         lens_vertical_m_per_rad=float(state.fields[1]),
-        camera_scale=1.0 - state.squares,
+        camera_scale=1.0 - state.squares if state.layout.n_cameras else start.camera_scale,
         noise_range_m=levels.range_m,
         noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
         noise_spin_deg=float(np.degrees(levels.spin_rad)),

@@ -18,7 +18,6 @@ from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
     Array,
@@ -344,26 +343,42 @@ def find_exchanged_lidars(
     return [EXCHANGED(names, fits=("mounting",))] if is_exchanged else []
 
 
-def loop_findings(between: Calibration, first: Calibration, second: Calibration, rig: Rig) -> list[Finding]:
-    """Compare two LiDARs' pose with that by a camera calibrated to both.
+class Loop(NamedTuple):
+    """A sensor calibrated to two LiDARs, and these to each other.
+
+    Attributes:
+        names: of the sensor and both LiDARs.
+        first, between, second: pose (4, 4) of the first LiDAR in the sensor's frame, of the second in the
+            first one's, and of the second in the sensor's, each with its covariance (6, 6).
+    """
+
+    names: tuple[str, str, str]
+    first: tuple[Array, Array]
+    between: tuple[Array, Array]
+    second: tuple[Array, Array]
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], tuple[str, str], tuple[str, str]]:
+        """The sensors of each pose."""
+        a, b, c = self.names
+        return (a, b), (b, c), (a, c)
+
+
+def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
+    """Compare the pose of two LiDARs with that by a sensor calibrated to both.
 
     All three results have seen the same boards: their errors are counted as independent.
-
-    Args:
-        between: of the two LiDARs.
-        first, second: of the camera and each of them.
-        rig: targets and limits.
     """
-    by_first, by_between = composition_slopes(first.T_cam_lidar, between.T_cam_lidar)
-    cov = by_first @ first.cov @ by_first.T + by_between @ between.cov @ by_between.T + second.cov
-    tangent = difference(first.T_cam_lidar @ between.T_cam_lidar, second.T_cam_lidar)
-    apart = PoseDifference(tangent, cov)
-    excess = rig.calibration.excess(apart)
+    (T_first, cov_first), (T_between, cov_between), (T_second, cov_second) = loop[1:]
+    by_first, by_between = composition_slopes(T_first, T_between)
+    cov = by_first @ cov_first @ by_first.T + by_between @ cov_between @ by_between.T + cov_second
+    apart = PoseDifference(difference(T_first @ T_between, T_second), cov)
+    excess = target.excess(apart)
     if excess <= 1:
         return []
-    severity = failing(excess > FAIL_FACTOR)
+    camera, *lidars = loop.names
     return [
         LIDARS_DIFFER(
-            f"{between.camera} and {between.lidar}", severity=severity, camera=first.camera, **apart.sizes
+            " and ".join(lidars), severity=failing(excess > FAIL_FACTOR), camera=camera, **apart.sizes
         )
     ]

@@ -1,10 +1,10 @@
 """Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
-detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict ->
-two LiDARs (`lidar_pairs`) -> the scene's opinion
+detections -> estimate of each camera with each LiDAR, and of every two LiDARs (`lidar_pairs`) -> all sensors
+that agree, as one (`rig_estimate`) -> checks, verdict -> the scene's opinion
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -22,7 +22,7 @@ from lce_rig.calibrate import (
 from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.result import error_to_reference, squares_scale
-from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
+from lce_rig.calibrate.rig_estimate import RigResult, SensorPair, estimate_rig
 from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
@@ -38,8 +38,10 @@ from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
     CameraEvidence,
     CameraPair,
+    Loop,
     camera_findings,
     find_exchanged_cameras,
+    loop_findings,
     relate,
 )
 from lce_rig.judge.session_check import find_meetings
@@ -48,7 +50,7 @@ from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
-from lce_rig.pipeline.lidar_pairs import calibrate_lidar_pairs, close
+from lce_rig.pipeline.lidar_pairs import SolvedLidars, judged_lidars, solve_lidar_pairs, with_estimate
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
@@ -65,7 +67,7 @@ class _Solved:
         refused: why captures without the board in both sensors are unusable.
         estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
-        together: the estimate of several cameras that it is part of; None where it stands alone.
+        together: the estimate of the sensors that it is part of; None where it stands alone.
     """
 
     pairs: tuple[Pair, ...]
@@ -73,7 +75,7 @@ class _Solved:
     refused: Mapping[str, Refusal]
     estimate: CalibrationEstimate
     validation: Validation
-    together: TogetherEstimate | None = None
+    together: RigResult | None = None
 
     @property
     def camera(self) -> str:
@@ -185,8 +187,8 @@ def calibrate_detections(
 ) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
 
-    Channels of one camera share pixels and lens: together they give one set of extrinsics. Cameras that saw
-    the same boards are compared with each other, and with method "ml" estimated together.
+    Channels of one camera share pixels and lens: together they give one set of extrinsics. Sensors that saw
+    the same boards are compared with each other, and with method "ml" estimated as one.
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
@@ -215,9 +217,9 @@ def calibrate_detections(
                     where = tuple(plan.figures[key] for key in ("n_captures", "is_enough", "placements"))
                     shortage = replace(shortage, figures={**shortage.figures, "where": where})
             shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
-    between: list[Calibration] = []
+    between: list[SolvedLidars] = []
     if cameras is None and channels is None:
-        between, lacking = calibrate_lidar_pairs(rig, detections, options or CalibrateOptions(), progress)
+        between, lacking = solve_lidar_pairs(rig, detections, options or CalibrateOptions(), progress)
         shortages += lacking
     if not alone and not between and not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
@@ -226,12 +228,16 @@ def calibrate_detections(
         )
     if not alone and not between:
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
-    if len(alone) > 1:
-        begin(progress, "comparing and joining cameras")
-    links = _compare(rig, detections, alone)
-    solved = _solve_together(rig, detections, alone, links)
-    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
-    return close([*calibrations, *between], rig), shortages
+    if len(alone) + len(between) > 1:
+        begin(progress, "comparing and joining sensors")
+    links, loops = _compare(rig, detections, alone), _open_loops(rig, alone, between)
+    solved, between = _solve_together(rig, detections, alone, between, links, loops)
+    calibrations = [_judged(rig, detections, solved, links, loops, k) for k in range(len(solved))]
+    calibrations += [
+        judged_lidars(rig, detections, own, [f for loop, f in loops if own.names in loop.pairs])
+        for own in between
+    ]
+    return calibrations, shortages
 
 
 def _pairs_by_sensors(
@@ -319,36 +325,80 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
     return links
 
 
-def _solve_together(
-    rig: Rig, detections: Detections, alone: Sequence[_Solved], links: Sequence[_Link]
-) -> list[_Solved]:
-    """Estimate cameras that agree jointly with method "ml"; leave the others unchanged.
+def _open_loops(
+    rig: Rig, alone: Sequence[_Solved], between: Sequence[SolvedLidars]
+) -> list[tuple[Loop, Finding]]:
+    """List loops of three sensors whose poses, each pair's alone, contradict each other."""
+    poses = {(own.camera, own.lidar): (own.estimate.T_cam_lidar, own.validation.cov) for own in alone}
+    poses |= {own.names: (own.T_first_second, own.cov) for own in between}
+    loops = [
+        Loop((a, b, c), poses[a, b], poses[b, c], poses[a, c])
+        for a, b in poses
+        for d, c in poses
+        if d == b and (a, c) in poses
+    ]
+    return [(loop, finding) for loop in loops for finding in loop_findings(loop, rig.calibration)]
 
-    A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
+
+def _solve_together(
+    rig: Rig,
+    detections: Detections,
+    alone: Sequence[_Solved],
+    between: Sequence[SolvedLidars],
+    links: Sequence[_Link],
+    loops: Sequence[tuple[Loop, Finding]],
+) -> tuple[list[_Solved], list[SolvedLidars]]:
+    """Estimate sensors that agree as one; leave the others unchanged.
+
+    A sensor that contradicts another, or its own captures, is excluded, as it would corrupt the others'
+    extrinsics. So is method "paper", which gives the solution of Algorithm 1.
     """
-    group = list(range(len(alone)))
-    for (first, second), pair, contradictions, _ in links:
-        if pair is not None and not contradictions:
-            group = [group[first] if number == group[second] else number for number in group]
-    contradicted = {
-        group[i] for (i, j), _, contradictions, _ in links if contradictions and group[i] == group[j]
+    excluded = {pair for loop, _ in loops for pair in loop.pairs}
+    excluded |= {
+        (alone[k].camera, alone[k].lidar) for members, _, found, _ in links if found for k in members
     }
-    solved = list(alone)
-    for number in sorted(set(group) - contradicted):
-        members = [k for k in range(len(alone)) if group[k] == number]
-        if len(members) < 2 or alone[members[0]].settings.method != "ml":
+    cameras = {
+        (own.camera, own.lidar): own
+        for own in alone
+        if own.settings.method == "ml" and own.is_still and _is_sound(own.validation)
+    }
+    lidars = {own.names: own for own in between if _is_sound(own.validation)}
+    sound = (cameras.keys() | lidars.keys()) - excluded
+    solved, solved_lidars = list(alone), list(between)
+    for pairs in _connected(sound):
+        if len(pairs) < 2:
             continue
-        together = calibrate_together(
-            {alone[k].camera: alone[k].estimate for k in members},
+        together = estimate_rig(
+            {pair: cameras[pair].estimate for pair in pairs if pair in cameras},
+            {pair: lidars[pair].given for pair in pairs if pair in lidars},
             rig.board.to_board(),
-            {alone[k].camera: alone[k].settings for k in members},
+            list(rig.lidars),
         )
-        for k in members:
-            own = alone[k]
-            estimate = together.estimates[own.camera]
-            validation = _examine(rig, detections, own.pairs, estimate)
-            solved[k] = replace(own, estimate=estimate, validation=validation, together=together)
-    return solved
+        for k, own in enumerate(alone):
+            if (own.camera, own.lidar) in pairs:
+                estimate = together.estimates[own.camera, own.lidar]
+                validation = _examine(rig, detections, own.pairs, estimate)
+                solved[k] = replace(own, estimate=estimate, validation=validation, together=together)
+        for k, two in enumerate(between):
+            if two.names in pairs:
+                solved_lidars[k] = with_estimate(rig, two, together.estimates[two.names])
+    return solved, solved_lidars
+
+
+def _is_sound(validation: Validation) -> bool:
+    """Check whether captures do not contradict each other so much that the result fails."""
+    return all(cause.severity != "error" for cause in validation.causes)
+
+
+def _connected(pairs: Iterable[SensorPair]) -> list[list[SensorPair]]:
+    """Group pairs that sensors connect, sorted."""
+    groups: list[tuple[set[str], list[SensorPair]]] = []
+    for pair in sorted(pairs):
+        touched = [group for group in groups if group[0] & set(pair)]
+        groups = [group for group in groups if not group[0] & set(pair)]
+        names = set(pair).union(*(group[0] for group in touched))
+        groups.append((names, sorted([pair, *(each for group in touched for each in group[1])])))
+    return [members for _, members in groups]
 
 
 def _judged(
@@ -356,6 +406,7 @@ def _judged(
     detections: Detections,
     solved: Sequence[_Solved],
     links: Sequence[_Link],
+    loops: Sequence[tuple[Loop, Finding]],
     k: int,
 ) -> Calibration:
     """Judge the extrinsics of index k and assemble their result."""
@@ -363,6 +414,7 @@ def _judged(
     mine = [link for link in links if k in link.members]
     others = [*estimate.association, *(finding for link in mine for finding in link.exchanged)]
     others += [finding for link in mine for finding in link.contradictions]
+    others += [finding for loop, finding in loops if (own.camera, own.lidar) in loop.pairs]
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())
     verdict, findings = judge(
@@ -422,10 +474,9 @@ def _judged(
 def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraPair) -> OtherCamera:
     """State the pose of another camera relative to the camera of index k."""
     own, other = solved[k], solved[other_k]
-    T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
-    cov = None
+    T, cov = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)[0], None
     if own.together is not None and own.together is other.together:
-        cov = np.asarray(J @ own.together.covariance_of(own.camera, other.camera) @ J.T)
+        T, cov = own.together.between(own.camera, other.camera)
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart.tangent)
     return OtherCamera(
         camera=other.camera,

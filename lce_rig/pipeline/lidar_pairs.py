@@ -1,39 +1,78 @@
-"""Estimate and judge the pose of every two LiDARs that saw the same boards.
-
-detections of both -> estimate as of a camera and a LiDAR -> the same checks -> comparison with the cameras
+"""Two LiDARs that saw the same boards: their captures, and the judgement of their pose.
 
 In a result the first LiDAR of the profile stands in the camera's place: T_cam_lidar takes points from the
 second LiDAR's frame to the first's.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, EstimateSettings
-from lce_rig.calibrate.between_lidars import close_loops, estimate_between_lidars
-from lce_rig.calibrate.result import capture_residual, summarise
+from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSettings
+from lce_rig.calibrate.between_lidars import LidarPair, match_lidars
+from lce_rig.calibrate.rig_estimate import estimate_rig
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert, relative_pose
+from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.geometry import Array, invert
 from lce_rig.core.progress import Progress, begin
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model, loop_findings
+from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model
 from lce_rig.judge.session_check import match_candidates
-from lce_rig.judge.validate import validate
-from lce_rig.judge.verdict import judge, with_findings
+from lce_rig.judge.validate import Validation, validate
+from lce_rig.judge.verdict import judge
 from lce_rig.pipeline.detect_session import candidates_of
 from lce_rig.pipeline.findings import SHORTAGE, few_detected
 from lce_rig.rig import Rig
 
 
-def calibrate_lidar_pairs(
+@dataclass(frozen=True, eq=False)
+class SolvedLidars:
+    """Two LiDARs, and the result of their captures.
+
+    Attributes:
+        pair: the first in the camera's place.
+        n_detected: captures with a board in both scans.
+        refused: why others are unusable.
+        given: the captures that agree.
+        estimate: of the second LiDAR's pose in an optical frame of the first.
+        validation: of the estimate.
+    """
+
+    pair: Pair
+    n_detected: int
+    refused: Mapping[str, Refusal]
+    given: LidarPair
+    estimate: CalibrationEstimate
+    validation: Validation
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of the first and the second LiDAR."""
+        return self.pair.camera, self.pair.lidar
+
+    @property
+    def T_first_second(self) -> Array:
+        """(4, 4) pose of the second LiDAR in the first one's frame."""
+        return np.asarray(invert(self.given.T_view) @ self.estimate.T_cam_lidar)
+
+    @property
+    def to_first(self) -> Array:
+        """(6, 6) rotation of tangents into the first LiDAR's frame."""
+        return np.kron(np.eye(2), self.given.T_view[:3, :3].T)
+
+    @property
+    def cov(self) -> Array:
+        """(6, 6) of `T_first_second`."""
+        return np.asarray(self.to_first @ self.validation.cov @ self.to_first.T)
+
+
+def solve_lidar_pairs(
     rig: Rig, detections: Detections, options: CalibrateOptions, progress: Progress
-) -> tuple[list[Calibration], list[Finding]]:
-    """Estimate and judge every two LiDARs of a session.
+) -> tuple[list[SolvedLidars], list[Finding]]:
+    """Estimate the pose of every two LiDARs of a session from their own captures alone.
 
     Args:
         rig: the profile.
@@ -44,68 +83,74 @@ def calibrate_lidar_pairs(
     Returns:
         The results, and for each other pair the cause.
     """
-    calibrations, shortages = [], []
+    solved, shortages = [], []
     for pair in detections.lidar_pairs(rig.lidars):
         begin(progress, str(pair))
         try:
-            calibrations.append(_calibrate(rig, detections.between(pair), pair, options))
+            solved.append(_solve(rig, detections.between(pair), pair, options))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             shortages.append(replace(shortage, subject=str(pair)))
-    return calibrations, shortages
+    return solved, shortages
 
 
-def close(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
-    """Compare each two LiDARs with the sensors calibrated to both, and adjust poses that agree.
+def with_estimate(rig: Rig, own: SolvedLidars, estimate: CalibrationEstimate) -> SolvedLidars:
+    """Replace the estimate and check it anew."""
+    return replace(own, estimate=estimate, validation=_validate(rig, own.pair, own.given, estimate))
 
-    A contradiction is a reason against all three results. Otherwise their poses compose exactly afterwards.
-    Covariances stay: the estimates share boards, so that the loop need not have made them better. Cameras'
-    method "paper" gives Algorithm 1's poses, which are not adjusted.
+
+def judged_lidars(
+    rig: Rig, detections: Detections, own: SolvedLidars, others: Sequence[Finding]
+) -> Calibration:
+    """Judge the pose of two LiDARs and assemble the result.
+
+    Args:
+        rig: the profile.
+        detections: of the session.
+        own: the LiDARs.
+        others: findings of other evidence.
     """
-    of_pair = {(c.camera, c.lidar): c for c in calibrations}
-    reasons: dict[tuple[str, str], list[Finding]] = {}
-    loops = [((a, b), (b, c), (a, c)) for a, b in of_pair for d, c in of_pair if d == b and (a, c) in of_pair]
-    for first, between, second in loops:
-        found = loop_findings(of_pair[between], of_pair[first], of_pair[second], rig)
-        for pair in (first, second, between):
-            reasons.setdefault(pair, []).extend(found)
-    judged = {
-        pair: with_findings(c, reasons[pair]) if reasons.get(pair) else c for pair, c in of_pair.items()
-    }
-    sound = {pair for pair, c in judged.items() if c.method == "ml" and c.verdict != "fail"}
-    sound -= {pair for pair, found in reasons.items() if found}
-    closed = close_loops({pair: (judged[pair].T_cam_lidar, judged[pair].cov) for pair in sound})
-    T = {pair: c.T_cam_lidar for pair, c in judged.items()} | closed
-    board, calibrations = rig.board.to_board(), []
-    for pair, c in judged.items():
-        others = {
-            name for loop in loops if pair in loop and closed.keys() >= set(loop) for name in sum(loop, ())
-        }
-        if not others:
-            calibrations.append(c)
-            continue
-        residuals = tuple(
-            capture_residual(T[pair], c.observations[r.capture], board, r.held_out_m) for r in c.residuals
-        )
-        composed = tuple(
-            replace(each, T_cam_other=relative_pose(T[pair], T[each.camera, c.lidar])[0])
-            for each in c.other_cameras
-        )
-        calibrations.append(
-            replace(
-                c,
-                T_cam_lidar=T[pair],
-                residuals=residuals,
-                metrics=summarise(residuals),
-                other_cameras=composed,
-                estimated_with=tuple(sorted({*c.estimated_with, *others} - set(pair))),
-            )
-        )
-    return calibrations
+    (first, second), estimate, validation = own.names, own.estimate, own.validation
+    scans, T = detections.lidars, own.T_first_second
+    n_captures = own.n_detected + len(own.refused)
+    others = [
+        *others,
+        *find_other_model(first, rig.lidars[first], scans[first].values()),
+        *find_other_model(second, rig.lidars[second], scans[second].values()),
+        *find_exchanged_lidars(
+            T, rig.nominal(first, second), str(own.pair), [rig.lidars[first], rig.lidars[second]]
+        ),
+    ]
+    verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, own.given.T_view)
+    distances_m = [o.image.distance_m for o in estimate.observations.values()]
+    T_first = invert(own.given.T_view)
+    return Calibration(
+        camera=first,
+        channels=(),
+        lidar=second,
+        T_cam_lidar=T,
+        cov=own.cov,
+        cov_shared=own.to_first @ validation.cov_shared @ own.to_first.T,
+        contributions=validation.contributions,
+        certificate=estimate.certificate,
+        metrics=estimate.metrics,
+        n_captures=n_captures,
+        n_detected=own.n_detected,
+        captures_used=estimate.used,
+        captures_refused=dict(sorted({**own.refused, **estimate.refused}.items())),
+        verdict=verdict,
+        findings=findings,
+        diagnostics=estimate.diagnostics,
+        method=estimate.method,
+        estimated_with=estimate.estimated_with,
+        board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
+        residuals=estimate.residuals,
+        observations={name: _seen_from(T_first, o) for name, o in estimate.observations.items()},
+    )
 
 
-def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateOptions) -> Calibration:
-    """Calibrate two LiDARs; raises NotEnoughDataError."""
+def _solve(rig: Rig, detections: Detections, pair: Pair, options: CalibrateOptions) -> SolvedLidars:
+    """Estimate the pose of two LiDARs; raises NotEnoughDataError."""
     first, second = pair.camera, pair.lidar
     board = rig.board.to_board()
     candidates, lacking = candidates_of(detections, pair)
@@ -119,44 +164,16 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
         EstimateSettings.of(options, rig.lidars[first]),
         EstimateSettings.of(options, rig.lidars[second]),
     )
-    estimate, rejected, T_view = estimate_between_lidars(candidates, boards, board, settings)
-    rejected = [match_candidates(o, board, estimate.T_cam_lidar) for o in rejected]
-    validation = validate(estimate, rig, first, second, None, rejected)
-    scans = detections.lidars
-    n_captures = len(candidates) + len(lacking)
-    T = invert(T_view) @ estimate.T_cam_lidar
-    others = [
-        *find_other_model(first, rig.lidars[first], scans[first].values()),
-        *find_other_model(second, rig.lidars[second], scans[second].values()),
-        *find_exchanged_lidars(
-            T, rig.nominal(first, second), f"{first} and {second}", [rig.lidars[first], rig.lidars[second]]
-        ),
-    ]
-    verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, T_view)
-    R = np.kron(np.eye(2), T_view[:3, :3].T)
-    distances_m = [o.image.distance_m for o in estimate.observations.values()]
-    return Calibration(
-        camera=first,
-        channels=(),
-        lidar=second,
-        T_cam_lidar=T,
-        cov=R @ validation.cov @ R.T,
-        cov_shared=R @ validation.cov_shared @ R.T,
-        contributions=validation.contributions,
-        certificate=estimate.certificate,
-        metrics=estimate.metrics,
-        n_captures=n_captures,
-        n_detected=len(candidates),
-        captures_used=estimate.used,
-        captures_refused=dict(sorted({**lacking, **estimate.refused}.items())),
-        verdict=verdict,
-        findings=findings,
-        diagnostics=estimate.diagnostics,
-        method=estimate.method,
-        board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
-        residuals=estimate.residuals,
-        observations={name: _seen_from(invert(T_view), o) for name, o in estimate.observations.items()},
-    )
+    given = match_lidars(candidates, boards, board, settings)
+    estimate = estimate_rig({}, {(first, second): given}, board, [first, second]).estimates[first, second]
+    validation = _validate(rig, pair, given, estimate)
+    return SolvedLidars(pair, len(candidates), lacking, given, estimate, validation)
+
+
+def _validate(rig: Rig, pair: Pair, given: LidarPair, estimate: CalibrationEstimate) -> Validation:
+    board = rig.board.to_board()
+    rejected = [match_candidates(o, board, estimate.T_cam_lidar) for o in given.rejected]
+    return validate(estimate, rig, pair.camera, pair.lidar, None, rejected)
 
 
 def _seen_from(T: Array, observation: Observation) -> Observation:

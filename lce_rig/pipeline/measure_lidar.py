@@ -15,8 +15,8 @@ from lce_rig.calibrate import (
     estimate_extrinsics,
 )
 from lce_rig.calibrate.algorithm_1.algorithm import solve
+from lce_rig.calibrate.lidar_errors import LidarErrors, estimate_lidar
 from lce_rig.calibrate.options import Tolerances
-from lce_rig.calibrate.together import LidarErrors, estimate_lidar
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError

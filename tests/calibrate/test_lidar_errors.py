@@ -7,9 +7,9 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.lidar_errors import WIDENED, estimate_lidar
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
-from lce_rig.calibrate.together import WIDENED, estimate_lidar
 from lce_rig.core.geometry import difference, exp_so3, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 

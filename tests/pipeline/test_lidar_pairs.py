@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate.between_lidars import close_loops
 from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, ProfileError
 from lce_rig.core.findings import Refusal
@@ -13,9 +12,8 @@ from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.export import ExportJob, export
-from lce_rig.judge.sensor_pairs import loop_findings
+from lce_rig.judge.sensor_pairs import Loop, loop_findings
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.pipeline.lidar_pairs import close
 from lce_rig.rig import Rig
 from lce_rig.rig.loading import dump_rig, parse_rig
 from tests.calibrate.boards import Scenario, scan_board
@@ -171,50 +169,19 @@ def test_a_result_of_lidars_is_read_back_and_exported(tmp_path):
     assert np.allclose(joint.T_parent_child, result.T_cam_lidar)
 
 
-def test_poses_of_a_camera_to_both_lidars_that_contradict_theirs_are_found():
-    rig = make_rig()
-    between = calibrate(rig, scan_both(14, 2, rig.board.to_board()))
+def test_loop_findings_open_loop_is_named():
+    cov = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 3e-4)] ** 2)
     T_cam_left = pose(exp_so3(np.radians([80.0, 5.0, 10.0])), np.array([0.0, -0.1, 0.2]))
-    first = replace(between, camera="cam", channels=("frames",), lidar="left", T_cam_lidar=T_cam_left)
-    second = replace(first, lidar="right", T_cam_lidar=T_cam_left @ between.T_cam_lidar)
-    assert not loop_findings(between, first, second, rig)
-    moved = perturb(second.T_cam_lidar, np.r_[0.0, 0.03, 0.0, np.radians([1.0, 0, 0])])
-    (finding,) = loop_findings(between, first, replace(second, T_cam_lidar=moved), rig)
-    assert finding.code == "verdict.lidars_differ"
+    T_cam_right, target = T_cam_left @ T_LEFT_RIGHT, make_rig().calibration
+
+    def found(T):
+        poses = (T_cam_left, cov), (T_LEFT_RIGHT, cov), (T, cov)
+        return loop_findings(Loop(("cam", "left", "right"), *poses), target)
+
+    assert not found(T_cam_right)
+    (finding,) = found(perturb(T_cam_right, np.r_[0.0, 0.03, 0.0, np.radians([1.0, 0, 0])]))
+    assert (finding.code, finding.subject) == ("verdict.lidars_differ", "left and right")
     assert finding.severity != "note"
-    judged = close([between, first, replace(second, T_cam_lidar=moved)], rig)
-    assert all("verdict.lidars_differ" in codes(c) for c in judged)
-    assert np.array_equal(judged[2].T_cam_lidar, moved)
-    nudged = perturb(second.T_cam_lidar, np.r_[0.0, 0.002, 0.0, np.radians([0.02, 0, 0])])
-    closed = close([between, first, replace(second, T_cam_lidar=nudged)], rig)
-    T = {(c.camera, c.lidar): c.T_cam_lidar for c in closed}
-    assert np.allclose(T["cam", "left"] @ T["left", "right"], T["cam", "right"], atol=1e-12)
-    assert [c.estimated_with for c in closed] == [("cam",), ("right",), ("left",)]
-    assert [c.verdict for c in closed] == [between.verdict] * 3
-
-
-@pytest.mark.parametrize("shared", [0.0, 0.7, 1.0])
-def test_poses_that_close_are_no_worse_than_each_alone(shared):
-    """Errors of the sensors' boards, `shared` of their variance, cancel in the loop; the others do not."""
-    rng, names = np.random.default_rng(0), ("cam", "left", "right", "top")
-    T = {name: pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for name in names}
-    pairs = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :]]
-    sigma = np.r_[np.full(3, 1e-3), np.full(3, 3e-4)]
-    before, after = [], []
-    for _ in range(200):
-        moves = {name: perturb(np.eye(4), np.sqrt(shared / 2) * sigma * rng.normal(size=6)) for name in names}
-        noisy = {(a, b): invert(T[a] @ moves[a]) @ T[b] @ moves[b] for a, b in pairs}
-        edges = {
-            pair: (perturb(T_ab, np.sqrt(1 - shared) * sigma * rng.normal(size=6)), np.diag(sigma**2))
-            for pair, T_ab in noisy.items()
-        }
-        closed = close_loops(edges)
-        for a, b in pairs:
-            truth = invert(T[a]) @ T[b]
-            before.append(difference(edges[a, b][0], truth) / sigma)
-            after.append(difference(closed[a, b], truth) / sigma)
-        assert np.allclose(closed["cam", "left"] @ closed["left", "top"], closed["cam", "top"], atol=1e-12)
-    assert np.mean(np.square(after)) <= np.mean(np.square(before)) * (0.6 if shared == 0 else 1 + 1e-6)
 
 
 def test_profiles_of_plain_plates_read_back_and_have_no_camera():

@@ -27,14 +27,14 @@ from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import LidarBoard, Observation
 
 # Maximum number of steps between fits of the levels, and of the last steps.
-_STEPS, _LAST_STEPS = 3, 20
+STEPS, _LAST_STEPS = 3, 20
 # Length of the next step that ends them, in standard deviations of all unknowns together.
-_NEAR, _SETTLED = 0.1, 5e-3
+NEAR, _SETTLED = 0.1, 5e-3
 # Rounds of the search for noise levels, each followed by a new linearisation.
 _LEVEL_ROUNDS = (8, 4, 8)
 # First blurs of ring ends, rad: until the edge shift is known, all of them may lie outside their intervals,
 # where a sharp density is flat.
-_BLURS_RAD = (4e-3, 1.5e-3)
+BLURS_RAD = (4e-3, 1.5e-3)
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 # Huber's constant, in standard deviations of a placement's influence (95 % efficient), and an upper bound.
@@ -257,7 +257,7 @@ def _maximise(
     now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     terms = approach(terms, now, held)
     for n_rounds in _LEVEL_ROUNDS:
-        terms = settle(terms, now, held, _STEPS, _NEAR)
+        terms = settle(terms, now, held, STEPS, NEAR)
         now = fit_levels(terms, now, usual, held, n_rounds)
         if terms.images:
             terms = replace(terms, trust=trust_captures(terms, now, held, placement))
@@ -266,8 +266,8 @@ def _maximise(
 
 def approach(terms: Terms, levels: Levels, priors: Priors) -> Terms:
     """Approach the optimum from a distant start, with blurred ring ends."""
-    for blur_rad in _BLURS_RAD:
-        terms = settle(terms, levels.blurred(blur_rad), priors, _STEPS, _NEAR)
+    for blur_rad in BLURS_RAD:
+        terms = settle(terms, levels.blurred(blur_rad), priors, STEPS, NEAR)
     return terms
 
 
@@ -447,11 +447,12 @@ def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages
 
     Of a placement that cameras saw in different numbers of captures, the smallest number counts.
     """
+    every = np.bincount(placement)[placement].astype(np.float64)
     fewest = np.full(len(placement), np.inf)
     for camera in images:
         numbers = placement[camera.capture]
         fewest[camera.capture] = np.minimum(fewest[camera.capture], np.bincount(numbers)[numbers])
-    return 1 / fewest
+    return 1 / np.where(np.isinf(fewest), every, fewest)
 
 
 def extrinsics_by_unknowns(terms: Terms) -> Array:

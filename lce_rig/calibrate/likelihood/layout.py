@@ -201,7 +201,7 @@ class State:
         z = np.zeros(layout.z.size)
         _, here, there = np.intersect1d(rings, other_rings, return_indices=True)
         z[layout.lasers[:, there]] = self.z[self.layout.lasers[:, here]]
-        for name in (*_FIELDS, "shifts", *BOARD):
+        for name in {*_FIELDS, "shifts", *BOARD} & set(layout.z) & set(self.layout.z):
             z[layout.z[name]] = self.z[self.layout.z[name]]
         return z
 

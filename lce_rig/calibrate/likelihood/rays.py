@@ -179,6 +179,19 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     )
 
 
+def spread(scans: StackedScans, captures: Indices, n_captures: int) -> StackedScans:
+    """Number the stacked captures anew, as some of more captures (n,), ascending, that other sensors saw."""
+    weight = np.ones(n_captures)
+    weight[captures] = scans.weight
+    return replace(
+        scans,
+        n_captures=n_captures,
+        capture=captures[scans.capture],
+        weight=weight,
+        end_capture=captures[scans.end_capture],
+    )
+
+
 def displacements(points: Array, T_lidar_board: Array, board: Board) -> Array:
     """Compute the displacements (4) to (6) of points (N, 3) on boards (N, 4, 4), frame lidar: (N, 3, 6)."""
     R, t = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.together import calibrate_together
-from lce_rig.core.geometry import difference, relative_pose
+from lce_rig.calibrate.rig_estimate import estimate_rig
+from lce_rig.core.geometry import difference
 from lce_rig.judge.contributions import summed_covariance
 from tests.calibrate.boards import BOARD
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
@@ -20,9 +20,9 @@ def alone(session):
     return {name: fit_extrinsic(captures, BOARD, ML) for name, captures in session.items()}
 
 
-def every(cameras):
-    """The same settings for each camera."""
-    return dict.fromkeys(cameras, ML)
+def join(own):
+    """Estimate cameras together with the LiDAR."""
+    return estimate_rig({(name, "lidar"): each for name, each in own.items()}, {}, BOARD, ["lidar"])
 
 
 def few_on_the_right(n, seed):
@@ -34,7 +34,7 @@ def few_on_the_right(n, seed):
 def run(sessions):
     """Estimate each session by camera and together."""
     each = [alone(session) for session in sessions]
-    return [(own, calibrate_together(own, BOARD, every(own))) for own in each]
+    return [(own, join(own)) for own in each]
 
 
 def sizes(errors):
@@ -55,47 +55,46 @@ def runs():
 
 def test_a_camera_with_few_captures_gains_from_one_with_many(runs):
     for own, together in runs:
-        before, after = own[RIGHT], together.estimates[RIGHT]
+        before, after = own[RIGHT], together.estimates[RIGHT, "lidar"]
         for part in (slice(0, 3), slice(3, 6)):
-            # Half to a third of the standard deviation is left: 0.07 deg, 3 mm come to 0.03 deg, 1.4 mm.
-            assert np.trace(after.cov[part, part]) < 0.7**2 * np.trace(before.cov[part, part])
+            # Half to three quarters of the standard deviation is left.
+            assert np.trace(after.cov[part, part]) < 0.8**2 * np.trace(before.cov[part, part])
         error = difference(after.T_cam_lidar, TRUTH[RIGHT])
         assert error @ np.linalg.solve(after.cov, error) < 25  # 0.9997 of chi square with 6 degrees
         assert after.estimated_with == (LEFT,)
         assert after.used == tuple(f"{k:06d}" for k in range(FEW))
-        assert len(together.estimates[LEFT].used) == 16
+        assert len(together.estimates[LEFT, "lidar"].used) == 16
 
 
 def test_the_cameras_place_to_each_other_is_known_better_than_each_to_the_lidar(runs):
     for _, together in runs:
-        left, right = (together.estimates[name] for name in (LEFT, RIGHT))
-        T, J = relative_pose(right.T_cam_lidar, left.T_cam_lidar)
-        cov = J @ together.covariance_of(RIGHT, LEFT) @ J.T
+        T, cov = together.between(RIGHT, LEFT)
         error = difference(T, T_RIGHT_LEFT)
         assert error @ np.linalg.solve(cov, error) < 25
         assert np.degrees(np.linalg.norm(error[3:])) < 0.06
         # Extrinsics with independent errors would compose to more than either.
-        alone = together.covariance_of(RIGHT, LEFT)[:6, :6]
+        alone = together.between(RIGHT, "lidar")[1]
         assert np.trace(cov[3:, 3:]) < np.trace(alone[3:, 3:])
 
 
-def test_blocks_of_the_joint_covariance_are_those_of_the_estimates(runs):
+def test_pairs_of_the_rig_are_those_of_the_estimates(runs):
     for _, together in runs:
         for name in (LEFT, RIGHT):
-            other = RIGHT if name == LEFT else LEFT
-            mine = together.covariance_of(name, other)[:6, :6]
-            estimate = together.estimates[name]
-            assert np.allclose(mine, estimate.cov + summed_covariance(estimate.sensitivities), rtol=1e-6)
-        assert np.linalg.eigvalsh(together.cov)[0] > 0
+            T, cov = together.between(name, "lidar")
+            estimate = together.estimates[name, "lidar"]
+            assert np.allclose(T, estimate.T_cam_lidar, atol=1e-12)
+            inflation = estimate.diagnostics.covariance_inflation
+            of_profile = summed_covariance(estimate.sensitivities)
+            assert np.allclose(cov - of_profile, estimate.cov / inflation, rtol=1e-5, atol=1e-12)
 
 
 def test_the_order_of_cameras_does_not_matter(runs):
     own, together = runs[0]
-    turned = calibrate_together(dict(reversed(own.items())), BOARD, every(own))
+    turned = join(dict(reversed(own.items())))
     assert turned.cameras == together.cameras
-    assert np.array_equal(turned.cov, together.cov)
+    assert np.array_equal(turned.between(LEFT, RIGHT)[1], together.between(LEFT, RIGHT)[1])
     for name in together.cameras:
-        first, second = (each.estimates[name] for each in (together, turned))
+        first, second = (each.estimates[name, "lidar"] for each in (together, turned))
         assert np.array_equal(first.T_cam_lidar, second.T_cam_lidar)
         assert first.diagnostics.figures() == second.diagnostics.figures()
 
@@ -105,7 +104,7 @@ def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
     seen = dict(own[RIGHT].observations)
     lidar = seen["000002"].lidar
     seen["000002"] = replace(seen["000002"], lidar=replace(lidar, points=lidar.points + 0.001))
-    together = calibrate_together({**own, RIGHT: replace(own[RIGHT], observations=seen)}, BOARD, every(own))
+    together = join({**own, RIGHT: replace(own[RIGHT], observations=seen)})
     for estimate in together.estimates.values():
         assert "000002" not in estimate.used
         assert len(estimate.residuals) == len(estimate.used)
@@ -123,7 +122,7 @@ def test_errors_and_claims_of_dozens_of_sessions_are_true():
         found = run(sessions)
         for name in (LEFT, RIGHT):
             before = [own[name] for own, _ in found]
-            after = [joint.estimates[name] for _, joint in found]
+            after = [joint.estimates[name, "lidar"] for _, joint in found]
             rows = []
             for estimates in (before, after):
                 errors = np.array([difference(e.T_cam_lidar, TRUTH[name]) for e in estimates])
@@ -144,7 +143,7 @@ def test_a_camera_that_saw_a_placement_once_loses_nothing_where_another_saw_it_o
     session = simulate_two(8, 0)
     again = [replace(item, capture=f"{k}{item.capture[1:]}") for k in range(1, 5) for item in session[LEFT]]
     once, often = (
-        calibrate_together(alone({LEFT: left, RIGHT: session[RIGHT]}), BOARD, every(session)).estimates[RIGHT]
+        join(alone({LEFT: left, RIGHT: session[RIGHT]})).estimates[RIGHT, "lidar"]
         for left in (session[LEFT], [*session[LEFT], *again])
     )
     ratio = np.sqrt(np.diag(often.cov) / np.diag(once.cov))

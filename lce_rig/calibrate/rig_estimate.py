@@ -1,0 +1,372 @@
+"""All sensors of a rig estimated as one, from estimates of pairs of them.
+
+Pairs say which captures agree, where the estimate starts, and how large the noise is. In one likelihood each
+sensor has one pose, so that loops of poses close, and what one LiDAR's errors or the board's do to one pair
+they do to all.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.between_lidars import LidarPair
+from lce_rig.calibrate.findings import TWO_PLACES
+from lce_rig.calibrate.likelihood.fit import JointEstimate
+from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
+from lce_rig.calibrate.likelihood.layout import Layout, State
+from lce_rig.calibrate.likelihood.levels import OF_IMAGES
+from lce_rig.calibrate.likelihood.rays import interior, spread, stack_scans
+from lce_rig.calibrate.likelihood.rig import RigEstimate, maximise_rig, relate
+from lce_rig.calibrate.observations import group_poses
+from lce_rig.calibrate.quadratics import jackknife_scatter
+from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
+from lce_rig.calibrate.session_lens import SessionLens
+from lce_rig.calibrate.uncertainty import widen, with_errors
+from lce_rig.core.board import Board
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array, invert
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+
+SensorPair = tuple[str, str]
+"""Names of a camera and a LiDAR, or of two LiDARs."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigResult:
+    """Poses of the sensors of a rig.
+
+    Attributes:
+        cameras, lidars: their names; the first LiDAR is the base.
+        estimates: of each pair that was given; two LiDARs' is of the second in an optical frame of the first.
+        joint: the estimate of all.
+    """
+
+    cameras: tuple[str, ...]
+    lidars: tuple[str, ...]
+    estimates: Mapping[SensorPair, CalibrationEstimate]
+    joint: RigEstimate
+
+    def on_base(self, sensor: str) -> tuple[Array, Array]:
+        """Pose of the base in a sensor's frame (4, 4), and its derivative by the unknowns (6, G)."""
+        if sensor in self.lidars:
+            return self.joint.lidar(self.lidars.index(sensor))
+        return self.joint.camera(self.cameras.index(sensor))
+
+    def between(self, second: str, first: str) -> tuple[Array, Array]:
+        """Pose of the first sensor in the second one's frame (4, 4), and its covariance (6, 6)."""
+        T, J = relate(self.on_base(second), self.on_base(first))
+        return T, np.asarray(J @ self.joint.cov_z @ J.T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What two sensors saw in a capture.
+
+    Attributes:
+        pair: the sensors.
+        capture: its name.
+        boards: in the scan of each LiDAR.
+        image: of the camera; None for two LiDARs.
+    """
+
+    pair: SensorPair
+    capture: str
+    boards: Mapping[str, LidarBoard]
+    image: ImageBoard | None
+
+
+def estimate_rig(
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+    between: Mapping[SensorPair, LidarPair],
+    board: Board,
+    lidars: Sequence[str],
+) -> RigResult:
+    """Estimate the poses of cameras and LiDARs in one likelihood.
+
+    Captures in which pairs use different surfaces of one scan are rejected.
+
+    Args:
+        cameras: estimates by the likelihood of cameras and LiDARs whose boards stood still.
+        between: pairs of LiDARs. All pairs together connect all sensors.
+        board: its specification.
+        lidars: names in the order of the profile.
+    """
+    held = {name for pair in (*cameras, *between) for name in pair}
+    of_lidars = tuple(name for name in lidars if name in held)
+    of_cameras = tuple(sorted(held - set(of_lidars)))
+    lenses = {camera: _lens_of(camera, cameras) for camera in of_cameras}
+    seen = list(_list_seen(cameras, between, lenses))
+    conflicts = _conflicts(seen)
+    seen = [each for each in seen if each.capture not in conflicts]
+    frame_of = _number_frames(seen)
+    F = max(frame_of.values()) + 1
+    boards: dict[str, dict[int, LidarBoard]] = {name: {} for name in of_lidars}
+    images: dict[str, dict[int, ImageBoard]] = {name: {} for name in of_cameras}
+    for each in seen:
+        frame = frame_of[each.capture]
+        for name, found in each.boards.items():
+            boards[name].setdefault(frame, found)
+        if each.image is not None:
+            images[each.pair[0]].setdefault(frame, each.image)
+    T_start = _spanning_poses(cameras, between, of_lidars[0])
+    T_base_board = _place_frames(F, boards, images, T_start)
+    stacked = [
+        stack_images(
+            np.array(sorted(images[name])),
+            [images[name][frame] for frame in sorted(images[name])],
+            board.pattern_offset_m,
+            lenses[name],
+        )
+        for name in of_cameras
+    ]
+    scans, donors = [], [_donor(name, cameras, between) for name in of_lidars]
+    for name in of_lidars:
+        frames = sorted(boards[name])
+        own = stack_scans([interior(boards[name][frame], board) for frame in frames], board)
+        scans.append(spread(own, np.array(frames), F))
+    stacked, image_levels = _weigh_cameras(of_cameras, stacked, cameras)
+    T_lidar_base = np.array([T_start[name] for name in of_lidars])
+    states: list[State] = []
+    for m, (scan, donor) in enumerate(zip(scans, donors, strict=True)):
+        n_optics = [] if m else [each.turns.shape[1] for each in stacked]
+        layout = Layout(n_optics, len(scan.rings))
+        z = donor.state.common_to(layout, donor.terms.scans.rings, scan.rings)
+        if m:
+            base = states[0]
+            z[layout.z["bow"]] = base.z[base.layout.z["bow"]]
+            z[layout.plate] = base.z[base.layout.plate]
+        T_cam = np.array([] if m else [T_start[name] for name in of_cameras]).reshape(-1, 4, 4)
+        states.append(State(layout, T_cam, T_lidar_base[m] @ T_base_board, np.zeros(F), z))
+    joint = maximise_rig(
+        scans,
+        stacked,
+        board,
+        states,
+        T_lidar_base,
+        [replace(donor.levels, **image_levels) for donor in donors],
+        [donor.priors for donor in donors],
+        group_poses(T_base_board),
+    )
+    result = RigResult(of_cameras, of_lidars, {}, joint)
+    of_pairs: dict[SensorPair, CalibrationEstimate] = {}
+    for pair, alone in cameras.items():
+        start = _start_of(alone, conflicts)
+        numbers = [frame_of[name] for name in alone.used if name in frame_of]
+        T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
+        estimate = _report(result, pair[1], start, T, J, board, numbers)
+        optics = joint.terms.base.state.layout.optics(of_cameras.index(pair[0]))
+        of_lens = stacked[of_cameras.index(pair[0])].of_lens
+        of_pairs[pair] = replace(
+            estimate,
+            lens=lenses[pair[0]],
+            cov_with_lens=np.asarray(J @ joint.cov_z[:, optics] @ of_lens),
+            joint=alone.joint,
+            estimated_with=tuple(sorted(held - set(pair))),
+            same_scan=alone.same_scan,
+            channels=alone.channels,
+            channel_difference=alone.channel_difference,
+            association=alone.association,
+        )
+    for pair, given in between.items():
+        start = _start_of(given.start, conflicts)
+        numbers = [frame_of[o.capture] for o in start.observations if o.capture in frame_of]
+        T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
+        R = np.kron(np.eye(2), given.T_view[:3, :3])
+        estimate = _report(result, pair[1], start, given.T_view @ T, R @ J, board, numbers, is_of_lidars=True)
+        of_pairs[pair] = replace(
+            estimate, joint=(given.joint, 0), estimated_with=tuple(sorted(held - set(pair)))
+        )
+    return replace(result, estimates=of_pairs)
+
+
+def _report(
+    result: RigResult,
+    lidar: str,
+    start: Start,
+    T: Array,
+    J: Array,
+    board: Board,
+    frames: Sequence[int],
+    is_of_lidars: bool = False,
+) -> CalibrationEstimate:
+    """Report a pose T (4, 4) with the derivative J (6, G) as the estimate of a pair."""
+    joint, m = result.joint, result.lidars.index(lidar)
+    scatter, constants = (J @ each @ J.T for each in joint.covariances)
+    if is_of_lidars:
+        constants = constants + joint.of_model(J)
+    left_out = jackknife_scatter(joint.cost.moves() @ J.T)
+    n_placements = len(np.unique(joint.placement[np.array(frames, dtype=np.intp)]))
+    cov, inflation = widen(scatter + constants, left_out, n_placements)
+    part, at = joint.terms.parts[m], joint.terms.places[m]
+    shift = at[part.state.layout.z["shifts"]][0]
+    figures = with_errors(
+        start.diagnostics, joint.levels[m], part.state, float(np.sqrt(joint.cov_z[shift, shift])), inflation
+    )
+    if result.cameras:
+        figures = replace(figures, camera_scale=1.0 - joint.terms.base.state.squares)
+    estimate = report(start, T, cov, board, with_parts(figures, scatter, constants))
+    moves = tuple(Sensitivity(name, 1.0, (J @ each).T) for name, each in joint.moves.items())
+    return replace(estimate, method="ml", sensitivities=moves)
+
+
+def _lens_of(camera: str, cameras: Mapping[SensorPair, CalibrationEstimate]) -> SessionLens | None:
+    """Choose the lens of the pair with the most captures."""
+    return max((e for (name, _), e in cameras.items() if name == camera), key=lambda e: len(e.used)).lens
+
+
+def _donor(
+    lidar: str, cameras: Mapping[SensorPair, CalibrationEstimate], between: Mapping[SensorPair, LidarPair]
+) -> JointEstimate:
+    """Choose the estimate of a pair that tells most of a LiDAR's errors and noise."""
+    found = [(len(e.used), e.joint[0]) for (_, name), e in cameras.items() if name == lidar and e.joint]
+    if found:
+        return max(found, key=lambda each: each[0])[1]
+    alone = [given.alone[pair.index(lidar)] for pair, given in between.items() if lidar in pair]
+    return max(alone, key=lambda each: len(each.placement))
+
+
+def _list_seen(
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+    between: Mapping[SensorPair, LidarPair],
+    lenses: Mapping[str, SessionLens | None],
+) -> Iterator[_Seen]:
+    """List what each pair saw in the captures that it uses, images with the lens of all."""
+    for pair, estimate in sorted(cameras.items(), key=lambda each: each[0]):
+        observations: Sequence[Observation] = list(estimate.observations.values())
+        lens = lenses[pair[0]]
+        if lens is not None and lens is not estimate.lens:
+            observations = lens.refit(observations)
+        for o in observations:
+            yield _Seen(pair, o.capture, {pair[1]: o.lidar}, o.image)
+    for pair, given in sorted(between.items(), key=lambda each: each[0]):
+        for name, both in given.boards.items():
+            yield _Seen(pair, name, dict(zip(pair, both, strict=True)), None)
+
+
+def _conflicts(seen: Sequence[_Seen]) -> dict[str, Refusal]:
+    """Find captures in which pairs use different surfaces of one scan."""
+    surfaces: dict[tuple[str, str], tuple[_Seen, bytes]] = {}
+    conflicts = {}
+    for each in seen:
+        for lidar, found in each.boards.items():
+            key = found.points.tobytes()
+            other, held = surfaces.setdefault((each.capture, lidar), (each, key))
+            if held != key:
+                first, second = _other_sensor(other, lidar), _other_sensor(each, lidar)
+                conflicts[each.capture] = TWO_PLACES.refusal(first=first, second=second)
+    return conflicts
+
+
+def _other_sensor(seen: _Seen, lidar: str) -> str:
+    return next(name for name in seen.pair if name != lidar)
+
+
+def _number_frames(seen: Sequence[_Seen]) -> dict[str, int]:
+    """Number captures from 0; those that hold the same scan of a LiDAR share a number."""
+    same: dict[str, str] = {}
+
+    def root(name: str) -> str:
+        while same.setdefault(name, name) != name:
+            name = same[name]
+        return name
+
+    scans: dict[tuple[str, bytes], str] = {}
+    for each in seen:
+        for lidar, found in each.boards.items():
+            first = scans.setdefault((lidar, found.points.tobytes()), each.capture)
+            one, other = sorted((root(first), root(each.capture)))
+            same[other] = one
+    numbers = {name: k for k, name in enumerate(sorted({root(each.capture) for each in seen}))}
+    return {each.capture: numbers[root(each.capture)] for each in seen}
+
+
+def _spanning_poses(
+    cameras: Mapping[SensorPair, CalibrationEstimate], between: Mapping[SensorPair, LidarPair], base: str
+) -> dict[str, Array]:
+    """Compose each sensor's T_sensor_base (4, 4) along the pairs with the most captures."""
+    edges = [(len(e.used), pair, e.T_cam_lidar) for pair, e in cameras.items()]
+    edges += [
+        (len(given.boards), pair, invert(given.T_view) @ given.start.T_cam_lidar)
+        for pair, given in between.items()
+    ]
+    edges.sort(key=lambda edge: (-edge[0], edge[1]))
+    found = {base: np.eye(4)}
+    for _ in edges:
+        for _, (first, second), T in edges:
+            if (first in found) != (second in found):
+                if first in found:
+                    found[second] = invert(T) @ found[first]
+                else:
+                    found[first] = T @ found[second]
+                break
+    return found
+
+
+def _place_frames(
+    n: int,
+    boards: Mapping[str, Mapping[int, LidarBoard]],
+    images: Mapping[str, Mapping[int, ImageBoard]],
+    T_start: Mapping[str, Array],
+) -> Array:
+    """Place the board of each frame: T_base_board (n, 4, 4), by a camera where one saw it."""
+    T = np.zeros((n, 4, 4))
+    for lidar, of_lidar in boards.items():
+        for frame, found in of_lidar.items():
+            T[frame] = invert(T_start[lidar]) @ found.T_lidar_board
+    for camera, of_camera in images.items():
+        for frame, image in of_camera.items():
+            T[frame] = invert(T_start[camera]) @ image.T_cam_board
+    return T
+
+
+def _weigh_cameras(
+    names: Sequence[str],
+    stacked: Sequence[StackedImages],
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+) -> tuple[list[StackedImages], dict[str, float]]:
+    """Give each camera's images their own errors: the images, and the levels, geometric means of all."""
+    if not names:
+        return [], {}
+    figures = [
+        max((e for pair, e in cameras.items() if pair[0] == name), key=lambda e: len(e.used)).diagnostics
+        for name in names
+    ]
+    logs = np.log(
+        [
+            [np.radians(d.noise_tilt_deg), np.radians(d.noise_spin_deg), d.noise_depth_m, d.noise_across_m]
+            for d in figures
+        ]
+    )
+    mean = logs.mean(axis=0)
+    scaled = [
+        images.with_larger_errors(dict(zip(OF_IMAGES, own, strict=True)))
+        for images, own in zip(stacked, np.exp(logs - mean).tolist(), strict=True)
+    ]
+    return scaled, dict(zip(OF_IMAGES, np.exp(mean).tolist(), strict=True))
+
+
+def _start_of(own: CalibrationEstimate | Start, conflicts: Mapping[str, Refusal]) -> Start:
+    """Remove captures with conflicts, and figures that apply to the pair alone."""
+    if isinstance(own, Start):
+        kept = [k for k, o in enumerate(own.observations) if o.capture not in conflicts]
+        mine = {o.capture: conflicts[o.capture] for o in own.observations if o.capture in conflicts}
+        return Start(
+            own.T_cam_lidar,
+            own.certificate,
+            [own.observations[k] for k in kept],
+            {**own.refused, **mine},
+            own.held_out_m[kept],
+            own.diagnostics,
+        )
+    singles = {name: own.captures_of([name]) for name in own.used}
+    residuals = [residual for residual in own.residuals if not singles[residual.capture] & conflicts.keys()]
+    mine = {name: why for name, why in conflicts.items() if name in set().union(*singles.values())}
+    return Start(
+        own.T_cam_lidar,
+        own.certificate,
+        [own.observations[residual.capture] for residual in residuals],
+        {**own.refused, **mine},
+        np.array([residual.held_out_m for residual in residuals]),
+        own.diagnostics,
+    )

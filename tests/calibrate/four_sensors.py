@@ -1,0 +1,114 @@
+"""Two cameras and two LiDARs on one rig; each placement of the board is seen by two or three of them."""
+
+import numpy as np
+
+from lce_rig.core.geometry import exp_so3, invert, pose
+from lce_rig.detect.detection import Detections
+from lce_rig.rig import Rig
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, photograph, random_pose, scan_board
+from tests.calibrate.two_cameras import REAL, T_RIGHT_LEFT
+
+T_REAR_FRONT = pose(exp_so3(np.radians([2.0, -3.0, 25.0])), np.array([0.15, -0.4, 0.06]))
+"""T_rear_front (4, 4) of the LiDARs."""
+ON_FRONT = {
+    "left": T_FORWARD,
+    "right": T_RIGHT_LEFT @ T_FORWARD,
+    "front": np.eye(4),
+    "rear": T_REAR_FRONT,
+}
+"""Pose (4, 4) of the LiDAR `front` in each sensor's frame."""
+SENSORS = tuple(ON_FRONT)
+
+
+def make_rig(sensors=SENSORS):
+    """Build the profile of some of the sensors, with exact nominal poses."""
+    lens = {
+        "model": "radtan",
+        **{key: getattr(CAMERA, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")},
+        "distortion": list(CAMERA.distortion),
+    }
+    cameras, lidars = (
+        [name for name in sensors if name in names] for names in (("left", "right"), ("front", "rear"))
+    )
+    return Rig.model_validate(
+        {
+            "format_version": 1,
+            "name": "four",
+            "board": {
+                "inner_corners": [BOARD.cols, BOARD.rows],
+                **{key: getattr(BOARD, key) for key in ("square_m", "width_m", "height_m")},
+            },
+            "lidars": {
+                name: {"model": "VLP-16", "frame": f"{name}_link", "topic": f"/{name}"} for name in lidars
+            },
+            "cameras": {
+                name: {
+                    "frame": f"{name}_link",
+                    "optical_frame": f"{name}_optical",
+                    "resolution_px": [CAMERA.width_px, CAMERA.height_px],
+                    "intrinsics": lens,
+                    "channels": {"frames": {"kind": "frames", "topic": f"/{name}/image_raw"}},
+                }
+                for name in cameras
+            },
+            "nominal_extrinsics": [
+                {
+                    "camera": first,
+                    "lidar": second,
+                    "matrix": between(first, second)[:3, :3].tolist(),
+                    "translation_m": between(first, second)[:3, 3].tolist(),
+                    "tolerance_deg": 5.0,
+                    "tolerance_m": 0.1,
+                }
+                for first in sensors
+                for second in lidars
+                if first in cameras or (first, second) == ("front", "rear")
+            ],
+        }
+    )
+
+
+def between(first, second):
+    """True pose (4, 4) of the second sensor in the first one's frame."""
+    return ON_FRONT[first] @ invert(ON_FRONT[second])
+
+
+def simulate(n, seed, *, sensors=SENSORS, n_seeing=(2, 3), scenario=REAL, moves=None):
+    """Simulate captures until each of n placements is seen by some of the sensors.
+
+    Args:
+        n: placements for each sensor, on average of two in three.
+        seed: of everything.
+        sensors: on the rig.
+        n_seeing: numbers of sensors of a placement; all where there are fewer.
+        scenario: noise.
+        moves: sensor -> function of a capture's number to its pose on the LiDAR `front`, where it moves.
+    """
+    rng, moves = np.random.default_rng([seed, 7]), moves or {}
+    bias_m = dict.fromkeys(sensors, 0.0)
+    for k, name in enumerate(name for name in sensors if name in ("front", "rear")):
+        of_lasers = scenario.laser_bias_sigma_m * np.random.default_rng([seed, k]).standard_normal(16)
+        bias_m[name] = of_lasers - of_lasers.mean() + scenario.range_offset_m
+    found = {name: {} for name in sensors}
+    for number in range(n):
+        seen = {}
+        while len(seen) < len(sensors):
+            T_front_board = invert(T_FORWARD) @ random_pose(rng, scenario, BOARD)
+            seen = {}
+            for name in sensors:
+                T = moves.get(name, lambda k, name=name: ON_FRONT[name])(number) @ T_front_board
+                is_lidar = name in ("front", "rear")
+                board = scan_board(T, rng, scenario, BOARD, bias_m[name]) if is_lidar else None
+                board = (
+                    [board]
+                    if board is not None
+                    else None
+                    if is_lidar
+                    else photograph(T, rng, scenario, BOARD)
+                )
+                if board is not None:
+                    seen[name] = board
+        for name in rng.permutation(list(sensors))[: rng.choice(n_seeing)]:
+            found[name][f"{number:06d}"] = seen[name]
+    images = {(name, "frames"): each for name, each in found.items() if name in ("left", "right")}
+    return Detections(images, {name: each for name, each in found.items() if name in ("front", "rear")})
