@@ -272,14 +272,16 @@ def _range_scale(finding: Finding) -> str:
 def _moved(finding: Finding) -> str:
     """The {place} {n_captures} captures, {captures}, fit a mounting {rotation_deg}, {translation_m} apart.
 
-    {neighbour} lies before or after them; {chance}: to differ as much on one mounting.
+    {neighbour} lies before or after them; {chance}: to differ as much on one mounting; {sensor} moved, where
+    others show that it did.
     """
     place = finding.figures["place"]
     text = fill("{n_captures} captures ({captures:few}) fit a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
     cameras = f"{finding.subject} in their images: " if finding.subject else ""
     which = f"the {place} " if place else ""
-    return f"{cameras}{which}{text}: a sensor moved {fill(when, finding.figures)}"
+    sensor = finding.figures.get("sensor") or "a sensor"
+    return f"{cameras}{which}{text}: {sensor} moved {fill(when, finding.figures)}"
 
 
 def _agree(finding: Finding) -> str:

@@ -33,7 +33,7 @@ from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.export.extrinsics import Reference
-from lce_rig.judge.findings import lacks_captures
+from lce_rig.judge.findings import EXCHANGED, lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
     CameraEvidence,
@@ -42,6 +42,7 @@ from lce_rig.judge.sensor_pairs import (
     camera_findings,
     find_exchanged_cameras,
     loop_findings,
+    name_moved,
     relate,
 )
 from lce_rig.judge.session_check import find_meetings
@@ -50,7 +51,13 @@ from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
-from lce_rig.pipeline.lidar_pairs import SolvedLidars, judged_lidars, solve_lidar_pairs, with_estimate
+from lce_rig.pipeline.lidar_pairs import (
+    SolvedLidars,
+    find_named,
+    judged_lidars,
+    solve_lidar_pairs,
+    with_estimate,
+)
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
@@ -232,12 +239,13 @@ def calibrate_detections(
         begin(progress, "comparing and joining sensors")
     links, loops = _compare(rig, detections, alone), _open_loops(rig, alone, between)
     solved, between = _solve_together(rig, detections, alone, between, links, loops)
-    calibrations = [_judged(rig, detections, solved, links, loops, k) for k in range(len(solved))]
-    calibrations += [
-        judged_lidars(rig, detections, own, [f for loop, f in loops if own.names in loop.pairs])
-        for own in between
-    ]
-    return calibrations, shortages
+    named = [(own.names, finding) for own in between for finding in find_named(rig, detections, own)]
+    calibrations = [_judged(rig, detections, solved, links, loops, named, k) for k in range(len(solved))]
+    for own in between:
+        others = [f for loop, f in loops if own.names in loop.pairs]
+        others += [finding for names, finding in named if names == own.names]
+        calibrations.append(judged_lidars(rig, own, others))
+    return name_moved(calibrations), shortages
 
 
 def _pairs_by_sensors(
@@ -328,9 +336,16 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
 def _open_loops(
     rig: Rig, alone: Sequence[_Solved], between: Sequence[SolvedLidars]
 ) -> list[tuple[Loop, Finding]]:
-    """List loops of three sensors whose poses, each pair's alone, contradict each other."""
-    poses = {(own.camera, own.lidar): (own.estimate.T_cam_lidar, own.validation.cov) for own in alone}
-    poses |= {own.names: (own.T_first_second, own.cov) for own in between}
+    """List loops of three sensors whose poses, each pair's alone, contradict each other.
+
+    Loops with a pair whose own captures contradict each other are open for that reason, and are left out.
+    """
+    poses = {
+        (own.camera, own.lidar): (own.estimate.T_cam_lidar, own.validation.cov)
+        for own in alone
+        if _is_sound(own.validation)
+    }
+    poses |= {own.names: (own.T_first_second, own.cov) for own in between if _is_sound(own.validation)}
     loops = [
         Loop((a, b, c), poses[a, b], poses[b, c], poses[a, c])
         for a, b in poses
@@ -407,6 +422,7 @@ def _judged(
     solved: Sequence[_Solved],
     links: Sequence[_Link],
     loops: Sequence[tuple[Loop, Finding]],
+    named: Sequence[tuple[SensorPair, Finding]],
     k: int,
 ) -> Calibration:
     """Judge the extrinsics of index k and assemble their result."""
@@ -415,6 +431,8 @@ def _judged(
     others = [*estimate.association, *(finding for link in mine for finding in link.exchanged)]
     others += [finding for link in mine for finding in link.contradictions]
     others += [finding for loop, finding in loops if (own.camera, own.lidar) in loop.pairs]
+    # Exchanged LiDARs exchange their cameras' extrinsics, too.
+    others += [finding for names, finding in named if own.lidar in names and finding.code == EXCHANGED.code]
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())
     verdict, findings = judge(

@@ -99,28 +99,27 @@ def with_estimate(rig: Rig, own: SolvedLidars, estimate: CalibrationEstimate) ->
     return replace(own, estimate=estimate, validation=_validate(rig, own.pair, own.given, estimate))
 
 
-def judged_lidars(
-    rig: Rig, detections: Detections, own: SolvedLidars, others: Sequence[Finding]
-) -> Calibration:
+def find_named(rig: Rig, detections: Detections, own: SolvedLidars) -> list[Finding]:
+    """Find LiDARs whose scans came under another name."""
+    (first, second), scans = own.names, detections.lidars
+    lidars = [rig.lidars[first], rig.lidars[second]]
+    return [
+        *find_other_model(first, lidars[0], scans[first].values()),
+        *find_other_model(second, lidars[1], scans[second].values()),
+        *find_exchanged_lidars(own.T_first_second, rig.nominal(first, second), str(own.pair), lidars),
+    ]
+
+
+def judged_lidars(rig: Rig, own: SolvedLidars, others: Sequence[Finding]) -> Calibration:
     """Judge the pose of two LiDARs and assemble the result.
 
     Args:
         rig: the profile.
-        detections: of the session.
         own: the LiDARs.
         others: findings of other evidence.
     """
     (first, second), estimate, validation = own.names, own.estimate, own.validation
-    scans, T = detections.lidars, own.T_first_second
     n_captures = own.n_detected + len(own.refused)
-    others = [
-        *others,
-        *find_other_model(first, rig.lidars[first], scans[first].values()),
-        *find_other_model(second, rig.lidars[second], scans[second].values()),
-        *find_exchanged_lidars(
-            T, rig.nominal(first, second), str(own.pair), [rig.lidars[first], rig.lidars[second]]
-        ),
-    ]
     verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, own.given.T_view)
     distances_m = [o.image.distance_m for o in estimate.observations.values()]
     T_first = invert(own.given.T_view)
@@ -128,7 +127,7 @@ def judged_lidars(
         camera=first,
         channels=(),
         lidar=second,
-        T_cam_lidar=T,
+        T_cam_lidar=own.T_first_second,
         cov=own.cov,
         cov_shared=own.to_first @ validation.cov_shared @ own.to_first.T,
         contributions=validation.contributions,
