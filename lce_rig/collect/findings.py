@@ -61,8 +61,7 @@ EVENTS_POLARITY = Kind(
 EVENTS_LATE = Kind(
     "events.late",
     "{subject}: the events are {late_s:+.2f} s late against the frames of the same camera",
-    "enter cameras.{camera}.channels.{channel}.timestamps.expected_offset_s: {expected_offset_s:g} "
-    "and collect again",
+    "enter cameras.{camera}.channels.{channel}.timestamps.expected_offset_s: {expected_offset_s:g}",
     severity="warning",
 )
 IMAGE_NONE = Kind("image.none", "no board in any image")

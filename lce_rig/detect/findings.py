@@ -170,7 +170,7 @@ IMAGE_HOT_PIXELS = Kind(
 IMAGE_HARDLY_MOVED = Kind(
     "image.hardly_moved",
     "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
-    MOVE_SLOWLY + "; if it moved so, uncover the lens or lower the contrast thresholds (biases)",
+    MOVE_SLOWLY + "; check lens and biases",
 )
 IMAGE_FEW_EVENTS = Kind(
     "image.few_events",
