@@ -26,6 +26,7 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
+from lce_rig.pipeline.findings import FEW_DETECTED
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -176,6 +177,9 @@ def calibrate(
             raise
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
+    for finding in (finding for c in result.pairs for finding in c.findings):
+        if finding.code == FEW_DETECTED.code:
+            show.warn("\n  ".join(map(str.strip, str(NotEnoughDataError.of(finding)).splitlines())))
     if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
         show.warn(f"{reference} has no T_cam_lidar for these sensors")
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.

@@ -63,6 +63,9 @@ def run_live(
         person = None
         if simulated:
             show.note("starting the simulated rig ...")
+            if any(camera.first_channel("events") for camera in rig.cameras.values()):
+                recorded = f"`lce-rig simulate --rig {rig.name} --recording FOLDER` writes them"
+                show.note(f"events are not simulated live: {recorded}")
             person = stack.enter_context(SimulatedRig(rig, seed or 0))
             write_truth(path / TRUTH, rig_truth(rig, seed or 0, SimulationOptions.for_rig(rig.name)))
         sources = open_live(rig) if person is None else person.sources

@@ -54,7 +54,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
 
-    Reads AEDAT4, Prophesee RAW (EVT3), ROS 1, ROS 2 and mcap bags, and HDF5 in DSEC's layout. Skips the
+    Reads AEDAT4, Prophesee RAW (EVT3), ROS 1, ROS 2 and mcap bags, and HDF5 (DSEC, Metavision). Skips the
     first images, until the network has settled, and prints how many.
     """
     reconstructor = Reconstructor()

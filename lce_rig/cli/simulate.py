@@ -3,15 +3,18 @@
 import json
 import re
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, path_option, rig_option
-from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.core.errors import SessionError, SourceError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, find_profile, load_rig, read_profile
@@ -28,6 +31,8 @@ from lce_rig.simulate.sampling import stamp_of
 
 TRUTH = "truth.json"
 _CAPTURES, _DURATION_S = 30, 20.0
+# Time to simulate 1 s of a recording, s.
+_WALL_PER_S = 10
 
 
 @click.command()
@@ -137,15 +142,40 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
 def _simulate_recording(
     folder: Path, rig: Rig, profile: str, duration_s: float, seed: int, options: SimulationOptions
 ) -> None:
+    if folder.exists():
+        hint = "Name another folder: recordings are never overwritten."
+        raise SourceError(f"{folder} exists already", hint)
+    show.note(f"simulating {duration_s:g} s of rig {rig.name}, about {_WALL_PER_S * duration_s:.0f} s ...")
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
-    with BagRecorder.in_folder(folder, rig) as recorder, show.progress_bar("simulating, s") as progress:
-        write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
-        for sample in recording:
-            recorder.write(sample)
-            progress(max(0, stamp_of(sample) - recording.start_ns) // 10**9, round(duration_s))
+    # Only a whole recording gets the folder's name.
+    with _beside(folder) as draft, show.progress_bar("simulating, ms") as progress:
+        with BagRecorder.in_folder(draft, rig) as recorder:
+            write_truth(draft / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
+            for sample in recording:
+                recorder.write(sample)
+                progress(max(0, stamp_of(sample) - recording.start_ns) // 10**6, round(1000 * duration_s))
+        draft.rename(folder)
     names = ", ".join(sorted(path.name for path in folder.iterdir()))
     show.note(f"{folder}: {duration_s:g} s of rig {rig.name}: {names}")
-    show.note(f"next: lce-rig collect --rig {shlex.quote(profile)} --from {shlex.quote(str(recorder.path))}")
+    bag = shlex.quote(str(folder / recorder.path.name))
+    show.note(f"next: lce-rig collect --rig {shlex.quote(profile)} --from {bag}")
+
+
+@contextmanager
+def _beside(folder: Path) -> Iterator[Path]:
+    """Give a path on a folder's disk, removed in the end unless it was renamed.
+
+    Raises:
+        SourceError: nothing can be written there.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        hidden = TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
+    except OSError as error:
+        hint = "Choose another folder."
+        raise SourceError(f"{folder} cannot be written: {error.strerror}", hint) from error
+    with hidden as place:
+        yield Path(place) / folder.name
 
 
 def require_kind(session: Path, seed: int | None) -> None:

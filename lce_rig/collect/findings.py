@@ -46,6 +46,24 @@ READ_NO_EVENTS_AT_SCAN = Kind(
     "no events at the time of the scan",
     "record events while the LiDAR runs and check that the clocks agree",
 )
+EVENTS_TURNED = Kind(
+    "events.turned",
+    "{subject}: the events are {turn} against the frames of the same camera (correlation {correlation:.2f})",
+    "turn the events or the frames in the driver, or in the recording",
+)
+EVENTS_POLARITY = Kind(
+    "events.polarity",
+    "{subject}: the polarity of the events is inverted (correlation with the frames {correlation:.2f}); "
+    "the extrinsics do not depend on it",
+    "exchange the polarities in the driver",
+    severity="warning",
+)
+EVENTS_LATE = Kind(
+    "events.late",
+    "{subject}: the events are {late_s:+.2f} s late against the frames of the same camera",
+    "enter cameras.{camera}.channels.{channel}.timestamps.expected_offset_s: {expected_offset_s:g}",
+    severity="warning",
+)
 IMAGE_NONE = Kind("image.none", "no board in any image")
 CALIBRATE_SAME_PLACEMENT = Kind("calibrate.same_placement", "same placement as in an earlier capture")
 LIDAR_ELSEWHERE = Kind(

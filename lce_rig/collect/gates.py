@@ -25,13 +25,15 @@ from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import (
     MEMORY_NS,
+    MIN_SPEED_MPS,
     event_quality,
     explain_missing_board,
     outline_px,
     too_fast,
+    too_few_events,
 )
 from lce_rig.detect.events.windows import is_flickering
-from lce_rig.detect.findings import IMAGE_FLICKER, IMAGE_HARDLY_MOVED
+from lce_rig.detect.findings import IMAGE_FLICKER
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
@@ -205,13 +207,14 @@ SPEED_WINDOW_S = 0.5
 BEST_SPEED_MPS = 0.1
 
 _LEAST_DETECTIONS = 3
-# Slower boards make no events, unless there are as many a pixel in a second as below.
-_MIN_SPEED_MPS = 0.03
+# Slower boards make no events, unless there are as many a pixel in a second as this.
 _PLENTY_EVENTS_PX = 4.0
+# Time without any event of a camera before which the board moves, ns: its stream has ended.
+_SILENT_NS = 100_000_000
 
 
 def judge_detection(
-    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig
+    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig, *, takes_frames: bool = False
 ) -> CaptureMoment | Refusal | None:
     """Check whether a detection is worth a capture.
 
@@ -219,13 +222,15 @@ def judge_detection(
         detection: the board in its frame.
         around: all detections shortly before and after, itself among them.
         rig: the profile.
+        takes_frames: whether frames are a moment without events, too.
 
     Returns:
         The moment; why it is none; or None where the tracker has counted why.
     """
     cuts = {cut.sensor: cut for cut in detection.frame.events}
     if detection.images and not cuts:
-        return READ_NO_EVENTS_AT_SCAN.refusal()
+        slow = _judge_frames(detection, around, rig) if takes_frames else None
+        return slow or READ_NO_EVENTS_AT_SCAN.refusal()
     watched = [key for key in sorted(detection.images) if key[0] in cuts]
     if not watched:
         # The events explain why their images do not show the board.
@@ -239,6 +244,19 @@ def judge_detection(
         return None
     judged = [_judge_camera(key, detection, around, cuts[key[0]], rig) for key in watched]
     return next((verdict for verdict in judged if isinstance(verdict, CaptureMoment)), judged[0])
+
+
+def _judge_frames(
+    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig
+) -> CaptureMoment | None:
+    """Make a moment of frames without events, of a board within the profile's limit of speed."""
+    ways = [_follow(key, around) for key in sorted(detection.images) if key not in detection.unfit]
+    for speed_mps, unsteady_m in filter(None, ways if detection.lidars else []):
+        if speed_mps <= rig.quality.max_board_speed_mps:
+            return CaptureMoment(
+                detection, {"speed_mps": round(speed_mps, 5), "unsteady_m": round(unsteady_m, 5)}
+            )
+    return None
 
 
 def _judge_camera(
@@ -265,10 +283,12 @@ def _judge_camera(
     limits = rig.quality
     if speed_mps > limits.max_board_speed_mps:
         return too_fast(speed_mps, limits.max_board_speed_mps)
-    is_slow = speed_mps < _MIN_SPEED_MPS
+    is_slow = speed_mps < MIN_SPEED_MPS
     needed_px = max(_PLENTY_EVENTS_PX if is_slow else 0.0, limits.min_events_px)
     if events_px < needed_px:
-        return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=needed_px)
+        if not is_slow and cut.last_ns < detection.frame.time_ns - _SILENT_NS:
+            return READ_NO_EVENTS_AT_SCAN.refusal()
+        return too_few_events(events_px, needed_px, np.nan if cut.missing_ns else speed_mps)
     if is_slow and is_flickering(recent):
         return IMAGE_FLICKER.refusal()
     figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
@@ -303,15 +323,25 @@ class MotionGate:
         taken: no placements yet; it says how far apart they must be.
         tally: receives why other detections are no moments.
         patience_s: for so long a moment waits for a better one of the same place.
+        takes_frames: whether frames are captured where events are missing, too.
 
     Attributes:
         judged: the last detection that could be judged: a moment that will do, or why it does not; None where
             no camera of events saw the board.
     """
 
-    def __init__(self, rig: Rig, taken: Placements, tally: Losses, patience_s: float = 2.0) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        taken: Placements,
+        tally: Losses,
+        patience_s: float = 2.0,
+        *,
+        takes_frames: bool = False,
+    ) -> None:
         self.judged: CaptureMoment | Refusal | None = None
         self._rig, self._taken, self._tally = rig, taken, tally
+        self._takes_frames = takes_frames
         self._half_ns, self._patience_ns = SPEED_WINDOW_S * 0.5e9, patience_s * 1e9
         # The last of those near in time wait for their neighbours, and moments for better ones.
         self._near: deque[BoardDetection] = deque()
@@ -348,7 +378,7 @@ class MotionGate:
             self._n_waiting -= 1
             now_ns = detection.frame.time_ns
             around = [each for each in self._near if abs(each.frame.time_ns - now_ns) <= self._half_ns]
-            self.judged = judge_detection(detection, around, self._rig)
+            self.judged = judge_detection(detection, around, self._rig, takes_frames=self._takes_frames)
             if isinstance(self.judged, Refusal):
                 self._tally.add(self.judged)
             while self._pending and not (
@@ -366,7 +396,8 @@ class MotionGate:
             return []
 
         def badness(moment: CaptureMoment) -> tuple[bool, float]:
-            is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
+            cuts = moment.detection.frame.events
+            is_short = not cuts or any(cut.missing_ns > 0 for cut in cuts)
             speed_ratio = max(moment.figures["speed_mps"], 1e-3) / BEST_SPEED_MPS
             return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
 

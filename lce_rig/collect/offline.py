@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from lce_rig.collect.board_search import sight_ahead
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.events_check import EventsCheck
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
 from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments, stillness_window_s
 from lce_rig.collect.placement_dedupe import (
@@ -207,7 +208,8 @@ class _Collector:
             samples = with_event_pictures(samples, rig, cameras, losses)
         tracker = BoardTracker(rig, _THOROUGH_S, refusals=losses)
         # Scans without an image made of events are counted by `with_event_pictures`.
-        frames = pair_by_time(samples, rig, Losses() if cameras else losses)
+        check = EventsCheck(rig)
+        frames = check.watch(pair_by_time(samples, rig, Losses() if cameras else losses))
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
         if recording.n_samples >= _LONG_SAMPLES and rig.cameras:
             detections = sight_ahead(tracker, frames)
@@ -218,13 +220,14 @@ class _Collector:
             window_s=stillness_window_s(rig),
         )
         if has_events:
-            gate = MotionGate(rig, Placements(), losses)
+            gate = MotionGate(rig, Placements(), losses, takes_frames=True)
         for moment in find_moments(detections, gate):
             confirmed = tracker.confirm(moment)
             if isinstance(confirmed, Refusal):
                 losses.add(confirmed)
             else:
                 yield confirmed
+        self.report.note(finding.sentence for finding in check.findings())
 
     def finish(self) -> CollectReport:
         """Close the books.

@@ -170,7 +170,13 @@ IMAGE_HOT_PIXELS = Kind(
 IMAGE_HARDLY_MOVED = Kind(
     "image.hardly_moved",
     "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
-    "uncover the lens; " + MOVE_SLOWLY,
+    MOVE_SLOWLY + "; check lens and biases",
+)
+IMAGE_FEW_EVENTS = Kind(
+    "image.few_events",
+    "the board moved at {speed_mps:.2f} m/s and made {events_px:.1f} events/px in 1 s "
+    "(minimum {min_events_px:g})",
+    "lower the contrast thresholds (biases) of the event camera, add light",
 )
 IMAGE_TOO_FAST = Kind(
     "image.too_fast",

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from lce_rig.core.data import Sample, Stream
+from lce_rig.core.data import Events, Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io.findings import CLOCK_SET_BACK, OUT_OF_ORDER
@@ -20,8 +20,13 @@ _MAX_OFFSET_S = 3600.0
 # September 2001: clocks that count from 1970 read more, those that count from their start less.
 _SINCE_1970_S = 1e9
 _CLOCK_JUMP_NS = 1_000_000_000
-# Packets of events count by their first timestamp.
+# Gap below which streams count as overlapping, s: sensors start one after the other.
 _ROUGH_S = 0.2
+# Units that timestamps of events are mistaken for, and the largest relative difference of the durations.
+_UNITS = (1_000, 1_000_000, 1_000_000_000)
+_UNIT_TOLERANCE = 0.2
+# Duration from which that is checked while packets come, so that no captures are made of them.
+_UNIT_CHECK_NS = 2_000_000_000
 # Sensors are switched on and off one after the other.
 _USUAL_LAG_S = 2.0
 
@@ -212,18 +217,33 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
         notes: receives the streams that cover only a part of the scans.
 
     Raises:
-        SourceError: a stream lies wholly before or after the scans, with the distance and the remedy.
+        SourceError: a stream lies wholly before or after the scans, with the distance and the remedy; or
+            timestamps of events are in another unit than their format's.
     """
     spans_ns: dict[Stream, tuple[int, int]] = {}
+    received_ns: dict[Stream, tuple[int, int]] = {}
     for sample in samples:
         time_ns = rig_time_ns(sample, rig)
         if time_ns is not None:
             stream = stream_of(sample, rig)
             first_ns, last_ns = spans_ns.get(stream, (time_ns, time_ns))
-            spans_ns[stream] = min(first_ns, time_ns), max(last_ns, time_ns)
+            # A file's packets of events may be as long as a scan sequence.
+            length_ns = int(sample.t_ns[-1] - sample.t_ns[0]) if isinstance(sample, Events) else 0
+            spans_ns[stream] = min(first_ns, time_ns), max(last_ns, time_ns + length_ns)
+            if isinstance(sample, Events) and sample.host_ns is not None:
+                first_ns, _ = received_ns.get(stream, (sample.host_ns, 0))
+                received_ns[stream] = first_ns, sample.host_ns
+                if sample.host_ns - first_ns > _UNIT_CHECK_NS:
+                    _check_unit(stream, spans_ns[stream], "their packets", received_ns[stream])
         yield sample
     spans = {stream: (1e-9 * span[0], 1e-9 * span[1]) for stream, span in sorted(spans_ns.items())}
     scans = {stream: span for stream, span in spans.items() if stream.kind == "scans"}
+    for stream, span_ns in sorted(spans_ns.items()):
+        if stream.kind == "events" and stream in received_ns:
+            _check_unit(stream, span_ns, "their packets", received_ns[stream])
+        elif stream.kind == "events" and scans:
+            lidar = next(iter(scans))
+            _check_unit(stream, span_ns, f"{lidar}'s scans", spans_ns[lidar])
     for (lidar, (scan_0, scan_1)), (camera, (first, last)) in product(scans.items(), spans.items()):
         if camera in scans:
             continue
@@ -252,6 +272,23 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
         if length_s - overlap_s > _USUAL_LAG_S:
             covered = f"{max(overlap_s, 0.0):.1f} of the {length_s:.1f} s of {lidar}'s scans"
             notes.append(f"{camera}: {camera.kind} cover {covered}")
+
+
+def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: tuple[int, int]) -> None:
+    """Compare the duration of events with that of their packets' receipt, or of a LiDAR's scans.
+
+    Raises:
+        SourceError: they differ by the factor between two units of time.
+    """
+    length_s, other_s = (1e-9 * max(last - first, 1) for first, last in (span_ns, other_ns))
+    for unit, (name, remedy) in product(_UNITS, (("small", "Multiply"), ("large", "Divide"))):
+        factor = unit if name == "small" else 1 / unit
+        if abs(other_s / (length_s * factor) - 1) < _UNIT_TOLERANCE:
+            raise SourceError(
+                f"{stream}: events span {length_s:.4g} s, {other} {other_s:.4g} s: the events' timestamps "
+                f"are {unit} times too {name}, in another unit than declared",
+                f"{remedy} them by {unit}: bags hold ns, HDF5 and AEDAT4 us.",
+            )
 
 
 def join_recordings(recordings: Sequence[Recording], rig: Rig) -> list[Recording]:

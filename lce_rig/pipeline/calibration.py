@@ -74,6 +74,7 @@ class _Solved:
         refused: why captures without the board in both sensors are unusable.
         estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
+        lacking: why channels of the camera are not part of it.
         together: the estimate of the sensors that it is part of; None where it stands alone.
     """
 
@@ -82,6 +83,7 @@ class _Solved:
     refused: Mapping[str, Refusal]
     estimate: CalibrationEstimate
     validation: Validation
+    lacking: tuple[Finding, ...] = ()
     together: RigResult | None = None
 
     @property
@@ -285,7 +287,8 @@ def _solve(
             continue
         shortages.append(few_detected(str(pair), len(of_channel), own_refused, n_needed))
     if not candidates:
-        raise NotEnoughDataError.of(shortages[0])
+        raise NotEnoughDataError.of(max(shortages, key=lambda shortage: shortage.figure("n_detected")))
+    lacking = tuple(replace(shortage, severity="note") for shortage in shortages)
     detected = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in detected}
     tolerances = Tolerances.of(rig.cameras[camera], rig.board)
@@ -294,7 +297,7 @@ def _solve(
     estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
     begin(progress, f"checking {camera} and {lidar}")
     validation = _examine(rig, detections, pairs, estimate)
-    return _Solved(tuple(pairs), settings, refused, estimate, validation)
+    return _Solved(tuple(pairs), settings, refused, estimate, validation, lacking)
 
 
 def _examine(
@@ -433,6 +436,7 @@ def _judged(
     others += [finding for loop, finding in loops if (own.camera, own.lidar) in loop.pairs]
     # Exchanged LiDARs exchange their cameras' extrinsics, too.
     others += [finding for names, finding in named if own.lidar in names and finding.code == EXCHANGED.code]
+    others += own.lacking
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     n_misfits = sum(why.code == IMAGE_MISFIT.code for why in own.refused.values())
     verdict, findings = judge(

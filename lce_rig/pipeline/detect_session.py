@@ -1,6 +1,7 @@
 """Find the board in every image, every scan and all raw events of a session, once."""
 
 import hashlib
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -214,6 +215,7 @@ class _Finder:
             rig.cameras[camera].to_intrinsics(),
             rig.quality,
             sweep_s=sweep_time_s(boards[0][1], 1 / rig.lidars[boards[0][0]].rate_hz) if boards else None,
+            frame_speed_mps=_frame_speed_mps(capture, camera),
         )
 
     def _remembered(
@@ -236,6 +238,13 @@ class _Finder:
 
     def _keep(self, key: str, detection: ImageDetection | LidarDetection | Image) -> None:
         store_arrays(self._session.cached(key), to_arrays(detection))
+
+
+def _frame_speed_mps(capture: Capture, camera: str) -> float:
+    """Read the board's speed in a camera's frames, as `collect` measured it; NaN if unknown."""
+    has_frames = any(sensor == camera for sensor, _ in capture.image_keys)
+    speed_mps = capture.meta.get("speed_mps")
+    return float(speed_mps) if has_frames and isinstance(speed_mps, float) else math.nan
 
 
 def _cache_key(digest: str, capture: Capture, sensor: str) -> str:

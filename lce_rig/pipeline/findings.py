@@ -1,9 +1,8 @@
 """Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
 
-from collections import Counter
 from collections.abc import Mapping
 
-from lce_rig.core.findings import Finding, Kind, Refusal
+from lce_rig.core.findings import Finding, Kind, Losses, Refusal
 from lce_rig.core.phrasing import captures_to_add
 
 
@@ -31,13 +30,15 @@ FEW_DETECTED = Kind(
 
 def few_detected(subject: str, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
     """Report too few captures with the board in both sensors, and the commonest causes of refusal."""
-    counts = Counter((why.code, f"{why.stage}: {why.sentence}") for why in refused.values())
+    losses = Losses()
+    for why in refused.values():
+        losses.add(why)
     return FEW_DETECTED(
         subject,
         n_detected=n_detected,
         n_captures=n_detected + len(refused),
         n_needed=n_needed,
-        causes=tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+        causes=tuple((n, why.code, f"{why.family}: {why.sentence}") for why, n in losses.counts()[:3]),
     )
 
 

@@ -83,6 +83,11 @@ class EventCut:
         return replace(join_events(self.packets).between(self.start_ns, self.end_ns), host_ns=None)
 
     @property
+    def last_ns(self) -> int:
+        """The rig's time of its last event or, where packets reach further, of its end."""
+        return min(int(self.packets[-1].t_ns[-1]), self.end_ns) + self.offset_ns
+
+    @property
     def sensor(self) -> str:
         """The camera."""
         return self.packets[0].sensor

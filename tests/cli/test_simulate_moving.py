@@ -139,3 +139,13 @@ def test_a_recording_overwrites_nothing(lce_rig, recorded, tmp_path):
     assert outcome.code == 5
     assert "exists already" in outcome.err
     assert contents(recorded) == before
+
+
+def test_a_recording_that_fails_leaves_no_files(lce_rig, tmp_path):
+    topics = {f"cameras__davis__channels__{name}__topic": "/davis/shared" for name in ("frames", "events")}
+    (tmp_path / "p.yaml").write_text(dump_rig(changed(small_rig("frames", "events"), **topics)))
+    outcome = lce_rig(
+        "simulate", "--rig", tmp_path / "p.yaml", "--recording", tmp_path / "r", "--duration", 0.25
+    )
+    assert outcome.code == 5 and "would carry both" in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["p.yaml"]

@@ -17,9 +17,9 @@ PLENTY = event_stream([(-1.3, 6.0, 6.0)])
 SOME = event_stream([(-1.3, 6.0, 2.0)])
 
 
-def choose(detections, rles):
+def choose(detections, rles, **options):
     tally = Losses()
-    moments = find_moments(detections, MotionGate(rles, Placements(0.15, 10.0), tally))
+    moments = find_moments(detections, MotionGate(rles, Placements(0.15, 10.0), tally, **options))
     return list(moments), tally.by_code()
 
 
@@ -42,7 +42,7 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rles):
     [
         (0.0, 0.2, 0.0, "image.hardly_moved"),
         (0.8, 6.0, 0.0, "image.too_fast"),
-        (0.1, 0.3, 0.0, "image.hardly_moved"),
+        (0.1, 0.3, 0.0, "image.few_events"),
         (0.0, 8.0, 100.0, "image.flicker"),
     ],
 )
@@ -75,7 +75,16 @@ def test_moments_before_the_stream_or_after_it_are_counted(rles):
     stream = event_stream([(1.0, 2.0, 4.0)])
     _, refused = choose(watch(rles, lambda t: (0.05 * t, 0.0), 6.0, stream), rles)
     # Scans 8 to 31 begin less than 1.2 s after its end and end less than 0.15 s before its beginning.
-    assert refused["read.no_events_at_scan"] == 8 + 28
+    # The board moves on in five of them with too few events left.
+    assert refused["read.no_events_at_scan"] == 8 + 28 + 5
+
+
+@pytest.mark.parametrize(("speed_mps", "is_kept"), [(0.1, True), (0.8, False)])
+def test_motion_gate_frames_without_events_are_kept(rles, speed_mps, is_kept):
+    detections = watch(rles, lambda t: (speed_mps * (t - 1.5), 0.0), 3.0, [])
+    moments, _ = choose(detections, rles, takes_frames=True)
+    assert bool(moments) is is_kept
+    assert all(m.figures["speed_mps"] == pytest.approx(speed_mps, abs=0.001) for m in moments)
 
 
 def test_a_board_that_the_lidar_does_not_see_is_no_moment(rles):

@@ -138,6 +138,30 @@ def test_a_partial_overlap_is_noted(rles):
     assert has_note(joined.notes, "davis.events", "0.1 of", "30.0 s", "lidar's")
 
 
+def test_check_overlap_long_packet_covers_its_span(rles):
+    t_ns = (T0_NS + np.linspace(0, 30e9, 5)).astype(np.int64)
+    joined = JoinedRecording([lidar(step_s=15.0)], rles)
+    list(check_overlap([*joined.samples(), packet(t_ns)], rles, joined.notes))
+    assert not has_note(joined.notes, "davis.events", "cover")
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1e-3, "small"), (1e-6, "small"), (1e3, "large")])
+@pytest.mark.parametrize("is_received", [True, False])
+def test_check_overlap_other_unit_is_named(rles, factor, words, is_received):
+    after_ns = np.linspace(0, 30_000_000_000, 50).astype(np.int64)
+    packets = [
+        packet(np.array([T0_NS + round(t * factor)]), T0_NS + int(t) if is_received else None)
+        for t in after_ns
+    ]
+    with pytest.raises(SourceError, match=f"times too {words}"):
+        list(check_overlap([*lidar(step_s=15.0).samples(), *packets], rles, []))
+
+
+def packet(t_ns, host_ns=None):
+    zeros = np.zeros(len(t_ns), np.uint16)
+    return Events("davis", t_ns, zeros, zeros, zeros > 0, 346, 260, host_ns)
+
+
 def test_a_part_that_is_torn_does_not_end_the_others(rles):
     torn = lidar(torn="lidar.bag is damaged")
     found = []

@@ -20,6 +20,7 @@ from lce_rig.detect.events.windows import (
     is_flickering,
 )
 from lce_rig.detect.findings import (
+    IMAGE_FEW_EVENTS,
     IMAGE_FLICKER,
     IMAGE_HARDLY_MOVED,
     IMAGE_HOT_PIXELS,
@@ -133,7 +134,20 @@ _MAX_HOT_SHARE = 0.5
 _SLOW_EVENTS_PX = 4.0
 
 
-def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
+#: Slower boards hardly make events.
+MIN_SPEED_MPS = 0.03
+
+
+def too_few_events(events_px: float, min_events_px: float, speed_mps: float = math.nan) -> Refusal:
+    """Refuse a board with too few events; of one known to have moved, the camera is the cause."""
+    if speed_mps >= MIN_SPEED_MPS:
+        return IMAGE_FEW_EVENTS.refusal(events_px=events_px, min_events_px=min_events_px, speed_mps=speed_mps)
+    return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=min_events_px)
+
+
+def gate_event_board(
+    found: ImageBoard, limits: QualitySettings, frame_speed_mps: float = math.nan
+) -> ImageBoard | Refusal:
     """Compare a board in an image from events with the profile's limits on events and motion.
 
     A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
@@ -142,12 +156,13 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
     Args:
         found: the board with figures of its events.
         limits: `quality` of the rig profile.
+        frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
     """
     q = found.events
     if q is None:
         return found
     if q.events_px < limits.min_events_px:
-        return IMAGE_HARDLY_MOVED.refusal(events_px=q.events_px, min_events_px=limits.min_events_px)
+        return too_few_events(q.events_px, limits.min_events_px, frame_speed_mps)
     # Comparisons with a figure that is not known are false.
     if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
         return too_fast(q.speed_mps, limits.max_board_speed_mps)
@@ -163,7 +178,13 @@ def too_fast(speed_mps: float, max_speed_mps: float) -> Refusal:
     return IMAGE_TOO_FAST.refusal(speed_mps=speed_mps, max_speed_mps=max_speed_mps)
 
 
-def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
+def explain_missing_board(
+    events: Events,
+    stamp_ns: int,
+    seen: Refusal,
+    limits: QualitySettings,
+    frame_speed_mps: float = math.nan,
+) -> Refusal:
     """Return the fault of the events that prevents a detection; `seen` if there is none.
 
     Args:
@@ -171,6 +192,7 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         stamp_ns: of the image.
         seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
+        frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
     """
     if seen.stage == "read":
         return seen
@@ -187,5 +209,5 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
     busiest = of_blocks[: max(1, round(_BUSY_SHARE * len(of_blocks)))]
     events_px, needed_px = float(busiest.mean()) / BLOCK_PX**2, max(_SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
-        return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=needed_px)
+        return too_few_events(events_px, needed_px, frame_speed_mps)
     return seen

@@ -1,5 +1,6 @@
 """The board in a stream of events: detected in an image at the requested time, and tracked through others."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -62,6 +63,7 @@ def find_event_board(
     limits: QualitySettings,
     *,
     sweep_s: float | None = None,
+    frame_speed_mps: float = math.nan,
 ) -> tuple[Image | Refusal, ImageBoard | Refusal]:
     """Make an image of the events up to a timestamp, find the board in it and follow it to either side.
 
@@ -73,6 +75,7 @@ def find_event_board(
         intrinsics: of the camera.
         limits: `quality` of the rig profile.
         sweep_s: how long the LiDAR sees the board; None if it does not.
+        frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
 
     Returns:
         The image at that time, and the board in it with its track in those about it; or why there are none.
@@ -86,14 +89,16 @@ def find_event_board(
     pictures = dict(zip(stamps, reconstructor.reconstruct([events], stamps), strict=True))
     picture = pictures.pop(stamp_ns)
     if isinstance(picture, Refusal):
-        return picture, explain_missing_board(events, stamp_ns, picture, limits)
+        return picture, explain_missing_board(events, stamp_ns, picture, limits, frame_speed_mps)
     found = find_image_board(picture, board, intrinsics, limits=limits, is_from_events=True)
     if isinstance(found, Refusal):
-        return picture, explain_missing_board(events, stamp_ns, found, limits)
+        return picture, explain_missing_board(events, stamp_ns, found, limits, frame_speed_mps)
     found = _followed(replace(found, stamp_ns=stamp_ns), pictures, board, intrinsics, limits)
     made = event_quality(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
     gated = gate_image_board(replace(found, events=with_motion(made, found, sweep_s)), limits)
-    return picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated
+    if isinstance(gated, ImageBoard):
+        gated = gate_event_board(gated, limits, frame_speed_mps)
+    return picture, gated
 
 
 def _followed(

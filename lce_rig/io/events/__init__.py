@@ -37,7 +37,7 @@ def open_events(
     """Open a recording of events.
 
     Args:
-        path: an AEDAT4, Prophesee .raw or HDF5 (DSEC) file, or a ROS 1 or ROS 2 bag.
+        path: an AEDAT4, Prophesee .raw or HDF5 file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
         topic: of a bag; None takes the only one with events.

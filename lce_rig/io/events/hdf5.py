@@ -1,7 +1,10 @@
-"""Events in HDF5 as the DSEC data set lays them out: events/{t,x,y,p}, t in us after t_offset.
+"""Events in HDF5: columns {t,x,y,p} of DSEC's group events or of the root, or Metavision's table CD/events.
+
+Times are microseconds, after t_offset where the file has one.
 
 References:
     https://dsec.ifi.uzh.ch/data-format/
+    https://docs.prophesee.ai/stable/data/file_formats/hdf5.html
 """
 
 from collections.abc import Iterator
@@ -19,7 +22,11 @@ from lce_rig.io import findings
 from lce_rig.io.events.event_recording import EventStream, to_ns
 
 _BLOCK_EVENTS = 1 << 20
-_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
+_FIELDS = ("t", "x", "y", "p")
+_GROUPS = ("events/", "CD/events/", "")
+_TABLE = "CD/events"
+_ECF = 36559
+"""Number of Prophesee's HDF5 filter, which Metavision's files are compressed by."""
 
 
 class Hdf5Events(EventStream):
@@ -36,7 +43,7 @@ class Hdf5Events(EventStream):
         self.resolution_px = None
         with _open(path) as file:
             # Columns of a torn file differ in length.
-            self._n_events = min(len(_column(file, name)) for name in _COLUMNS)
+            self._n_events = min(map(len, _columns(file)))
             self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
@@ -46,7 +53,7 @@ class Hdf5Events(EventStream):
             SourceError: they are compressed by a filter that is not installed, or damaged.
         """
         with _open(self._path) as file:
-            columns = [_column(file, name) for name in _COLUMNS]
+            columns = _columns(file)
             for begin in range(0, self._n_events, _BLOCK_EVENTS):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
@@ -74,9 +81,36 @@ def _open(path: Path) -> Iterator[Any]:
     except ImportError as error:
         hint = "pip install 'lce-rig[events]'"
         raise SourceError(f"{path}: {error.name} is not installed", hint) from None
-    hint = "Expected DSEC's layout: events/t, events/x, events/y, events/p."
+    hint = f"Expected t, x, y and p: columns of the group events or of the root, or fields of {_TABLE}."
     with reading(path, SourceError, hint), h5py.File(path, "r") as file:
         yield file
+
+
+def _columns(file: Any) -> list[Any]:
+    """Find the columns t, x, y and p, each of which reads a slice as an array (N,).
+
+    Raises:
+        ValueError: there are none.
+    """
+    table = file.get(_TABLE)
+    if {*_FIELDS} <= {*(getattr(getattr(table, "dtype", None), "names", None) or ())}:
+        _require_filter(table)
+        return [table.fields(name) for name in _FIELDS]
+    group = next((group for group in _GROUPS if f"{group}t" in file), _GROUPS[0])
+    return [_column(file, f"{group}{name}") for name in _FIELDS]
+
+
+def _require_filter(table: Any) -> None:
+    """Raise SourceError for a table compressed by Prophesee's filter if that is not installed."""
+    import h5py
+
+    settings = table.id.get_create_plist()
+    filters = {settings.get_filter(k)[0] for k in range(settings.get_nfilters())}
+    if _ECF in filters and not h5py.h5z.filter_avail(_ECF):
+        raise SourceError(
+            f"{table.file.filename}: compressed by Prophesee's filter hdf5_ecf, which is not installed",
+            "Set HDF5_PLUGIN_PATH to the folder of Metavision's HDF5 plugins, or record RAW (EVT3).",
+        )
 
 
 def _column(file: Any, name: str) -> Any:

@@ -37,6 +37,28 @@ def write_dsec(path, events):
         file["ms_to_idx"] = np.zeros(1, np.uint64)
 
 
+def write_metavision(path, events):
+    import h5py
+
+    table = np.empty(len(events), [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+    table["x"], table["y"], table["p"], table["t"] = columns_of(events)
+    with h5py.File(path, "w") as file:
+        file["CD/events"] = table
+        file["CD/indexes"] = np.zeros(1, [("id", "<u8"), ("ts", "<i8")])
+
+
+def write_columns_at_root(path, events):
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, column in zip("xypt", columns_of(events), strict=True):
+            file[name] = column
+
+
+def columns_of(events):
+    return events.x, events.y, events.polarity.astype(np.int16), events.t_ns // 1000
+
+
 def write_raw(path, events):
     head = "% evt 3.0\n% geometry 346x260\n% end\n"
     # The raw formats count from the sensor's start, and so do their stamps here.
@@ -49,6 +71,8 @@ WRITERS: dict[str, Callable[[Path, Events], object]] = {
     "a.bag": lambda path, events: write_event_bag(path, [events]),
     "ros2": lambda path, events: write_event_bag(path, [events]),
     "a.h5": write_dsec,
+    "metavision.h5": write_metavision,
+    "root.hdf5": write_columns_at_root,
     "a.raw": write_raw,
 }
 
