@@ -193,6 +193,11 @@ def progress_bar(title: str) -> Iterator[ProgressBar]:
         yield ProgressBar(bar, title)
 
 
+def harmless(text: str) -> str:
+    """Write a stranger's control characters as escapes, so that a terminal does not obey them."""
+    return "".join(each if each.isprintable() or each in "\n\t" else repr(each)[1:-1] for each in text)
+
+
 def escape(text: str) -> str:
     """Keep rich from reading brackets in names as markup."""
     from rich.markup import escape as escape_markup
