@@ -142,7 +142,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
     for line in plan.diff if has_diff else ():
-        click.echo(line)
+        click.echo(show.harmless(line))
 
 
 def _print_changes(plan: Plan, say: Callable[[str], None]) -> None:
@@ -184,21 +184,21 @@ def _show_standing(state: TargetState, target: TargetSettings, *, as_json: bool)
     _warn_of_changes(state.changed)
     for kept in state.releases:
         if kept.reason:
-            show.note(f"{kept.name} was forced: {show.harmless(kept.reason)}")
+            show.note(f"{kept.name} was forced: {kept.reason}")
     if state.is_pending:
         show.warn("the command after the deployment has not succeeded; the same deployment runs it again")
 
 
 def _warn_of_changes(changed: Any) -> None:
     if changed:
-        show.warn(f"not as it was deployed: {show.harmless(differences_in_words(changed))}")
+        show.warn(f"not as it was deployed: {differences_in_words(changed)}")
 
 
 def _described(release: ReleaseRecord) -> str:
     verdicts = ", ".join(f"{pair} {verdict}" for pair, verdict in release.verdicts.items())
     robot = f"robot {release.robot}, " if release.robot else ""
     dated = f"captures of {release.date}, " if release.date else ""
-    return show.harmless(f"{release.name} ({robot}{dated}{verdicts})")
+    return f"{release.name} ({robot}{dated}{verdicts})"
 
 
 def _show_done(done: Deployed, target: TargetSettings, again: str, *, as_json: bool) -> None:
@@ -216,4 +216,4 @@ def _show_done(done: Deployed, target: TargetSettings, again: str, *, as_json: b
         _warn_of_changes(done.changed_there)
         show.note(f"the changed files stay there in releases/{done.replaces}/")
     if done.output:
-        show.say(show.harmless(done.output.rstrip()))
+        show.say(done.output.rstrip())

@@ -27,12 +27,12 @@ _HANG = 3
 
 def note(text: str) -> None:
     """Print a line that is not the result, on stderr."""
-    click.echo(wrapped(text, sys.stderr), err=True)
+    click.echo(wrapped(harmless(text), sys.stderr), err=True)
 
 
 def say(text: str) -> None:
     """Print a line of the result on stdout."""
-    click.echo(wrapped(text, sys.stdout))
+    click.echo(wrapped(harmless(text), sys.stdout))
 
 
 def wrapped(text: str, stream: Any) -> str:
@@ -89,7 +89,7 @@ def command(verb: str, session: Path, options: str = "") -> str:
 
 def warn(text: str) -> None:
     """Print a warning on stderr."""
-    click.secho(wrapped(f"warning: {text}", sys.stderr), fg="yellow", err=True)
+    click.secho(wrapped(f"warning: {harmless(text)}", sys.stderr), fg="yellow", err=True)
 
 
 def warn_of(findings: Iterable[Finding]) -> None:
