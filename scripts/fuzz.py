@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Kill the program again and again, and print as JSON what was lost.
+"""Kill the program, or give it hostile inputs, and print as JSON what went wrong.
 
     scripts/fuzz.py kills --n 200               `collect`, killed while it captures
     scripts/fuzz.py result-kills --n 200        `calibrate`, `verify`, `intrinsics`, killed
     scripts/fuzz.py deploy-kills --n 200        `deploy`, killed, into a folder and over ssh
     scripts/fuzz.py interrupts --n 100          Ctrl-C at any moment of any verb
+    scripts/fuzz.py inputs                      hostile files, links and pipes as inputs
 
 Exits with 1 if anything was lost. CONTRIBUTING.md describes the checks.
 """
@@ -23,6 +24,7 @@ TARGETS = {
     "result-kills": ("fuzzing.result_kills:fuzz_result_kills", 200, "verbs killed about their results"),
     "deploy-kills": ("fuzzing.deploy_kills:fuzz_deploy_kills", 200, "deployments, killed"),
     "interrupts": ("fuzzing.interrupts:fuzz_interrupts", 100, "Ctrl-C at any moment"),
+    "inputs": ("fuzzing.inputs:fuzz_inputs", 100, "hostile files, links and pipes as inputs"),
 }
 """By name: a function of (n, seed) whose report has `n_wrong`; the default n; help."""
 

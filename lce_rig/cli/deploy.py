@@ -1,6 +1,7 @@
 """`lce-rig deploy`: put a result on a robot, ask what is there, or go back."""
 
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,11 @@ def deploy(
     software reads PATH/current/. One rename makes the new files current, after they were read back; after any
     interruption, the robot has the earlier set or the new one. Earlier sets are kept.
 
-    Refused with exit code 7: a failed result, another robot's name or serial numbers, captures older than
-    those deployed. Exits with 8 if the target was not reached or written and holds the earlier set, and with
-    9 if the command after it failed and the new set is in place.
+    Refused with exit code 7: a failed result, another rig, another robot's name or serial numbers, captures
+    older than those deployed, MARGINAL in place of PASS, and sensors that move by more than the tolerance of
+    the profile's nominal extrinsics (5 deg, 100 mm where it has none). Exits with 8 if the target was not
+    reached or written and holds the earlier set, and with 9 if the command after it failed and the new set
+    is in place.
     """
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
@@ -90,8 +93,15 @@ def deploy(
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
+
+    def announce(plan: Plan) -> None:
+        if plan.state.current is not None:
+            _print_changes(plan, show.note)
+
     try:
-        done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
+        done = deployment.deploy(
+            result, opened.rig, target, session=opened, reason=reason.strip(), announce=announce
+        )
     except ResultRefusedError as error:
         forced = f"{again}{f' --name {name}' if name else ''} --force --reason TEXT"
         raise ResultRefusedError(
@@ -120,11 +130,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
         return
     current = plan.state.current
     show.say(f"{target.to}: {'nothing deployed yet' if current is None else _described(current)}")
-    for change in () if plan.is_in_place else plan.sensors:
-        how = "new" if change.is_new else "removed"
-        if change.rotation_deg is not None and change.translation_m is not None:
-            how = f"moves by {sizes(change.rotation_deg, change.translation_m)}"
-        show.say(f"  {change.camera} and {change.lidar}: {how}")
+    _print_changes(plan, show.say)
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
         show.say("nothing to change: these very files are in place")
@@ -136,7 +142,18 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
     for line in plan.diff if has_diff else ():
-        click.echo(line)
+        click.echo(show.harmless(line))
+
+
+def _print_changes(plan: Plan, say: Callable[[str], None]) -> None:
+    """Print a line of each sensor: its movement, and its verdict where that changes."""
+    for change in () if plan.is_in_place else plan.sensors:
+        how = "new" if change.is_new else "removed"
+        if change.rotation_deg is not None and change.translation_m is not None:
+            how = f"moves by {sizes(change.rotation_deg, change.translation_m)}"
+        if change.verdict and change.verdict_there not in ("", change.verdict):
+            how += f", {change.verdict_there} becomes {change.verdict}"
+        say(f"  {change.camera} and {change.lidar}: {how}")
 
 
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}
@@ -161,7 +178,7 @@ def _show_standing(state: TargetState, target: TargetSettings, *, as_json: bool)
     for kept in state.releases:
         mark = " *" if kept.name == current.name else ""
         cells = (f"{kept.name}{mark}", kept.time, kept.by, kept.robot or "-", kept.date[:10] or "-")
-        rows.append(map(show.escape, cells))
+        rows.append(map(show.escape, map(show.harmless, cells)))
     headings = ("release", "deployed", "by", "robot", "captures of")
     show.print_table(show.plain_table("", *headings, rows=rows))
     _warn_of_changes(state.changed)

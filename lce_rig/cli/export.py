@@ -95,6 +95,7 @@ def export(
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
         findings: list[Finding] = []
+        earlier = {path.name for path in output.iterdir()}
         files = lce.export(
             pairs,
             opened.rig,
@@ -106,7 +107,7 @@ def export(
             findings=findings,
         )
         for file in files:
-            show.say(str(file))
+            show.say(f"{file} (replaced)" if file.name in earlier else str(file))
         for finding in findings:
             advice = finding.advice_at(str(session))
             (show.note if finding.severity == "note" else show.warn)(f"{finding.text}: {advice}".rstrip(": "))

@@ -112,7 +112,7 @@ def run(
     from lce_rig.fleet.storage import Storage
     from lce_rig.fleet.work import Settings
 
-    place = Storage.at(registry)
+    place = Storage.at(registry).require_folder()
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
     limits = (time_limit, memory_limit)
     settings = Settings(place.url, method, *limits, retry)
@@ -165,7 +165,7 @@ def table(registry: str, where: str, columns: list[str] | None, as_json: bool, r
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.storage import Storage
 
-    opened: Registry = Registry(Storage.at(registry))
+    opened: Registry = Registry(Storage.at(registry).require_folder())
     if rebuild:
         if not opened.place.exists():
             raise SessionError(
@@ -234,7 +234,7 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     from lce_rig.fleet.report import FleetReport
     from lce_rig.fleet.storage import Storage
 
-    made = FleetReport.of(Registry(Storage.at(registry)))
+    made = FleetReport.of(Registry(Storage.at(registry).require_folder()))
     write_atomically(output, made.page())
     if json_file is not None:
         made.write_json(json_file)
@@ -285,7 +285,7 @@ def deploy(
     from lce_rig.fleet.rollout import newest_results, roll_out
     from lce_rig.fleet.storage import Storage
 
-    opened = Registry(Storage.at(registry))
+    opened = Registry(Storage.at(registry).require_folder())
     newest = newest_results(opened, where)
     if dry_run:
         rows = [map(show.escape, (robot, state.folder, state.detail)) for robot, state in newest.items()]

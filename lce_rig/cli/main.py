@@ -151,7 +151,7 @@ def _report(error: BaseException, *, show_traceback: bool) -> int:
         return EXIT_BUG
     if show_traceback:
         traceback.print_exception(error)
-    click.secho(show.wrapped(f"error: {what}", sys.stderr), fg="red", err=True)
+    click.secho(show.wrapped(f"error: {show.harmless(what)}", sys.stderr), fg="red", err=True)
     for line in hint.splitlines():
         show.note(f"  {line}")
     return code

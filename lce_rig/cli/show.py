@@ -27,12 +27,12 @@ _HANG = 3
 
 def note(text: str) -> None:
     """Print a line that is not the result, on stderr."""
-    click.echo(wrapped(text, sys.stderr), err=True)
+    click.echo(wrapped(harmless(text), sys.stderr), err=True)
 
 
 def say(text: str) -> None:
     """Print a line of the result on stdout."""
-    click.echo(wrapped(text, sys.stdout))
+    click.echo(wrapped(harmless(text), sys.stdout))
 
 
 def wrapped(text: str, stream: Any) -> str:
@@ -89,7 +89,7 @@ def command(verb: str, session: Path, options: str = "") -> str:
 
 def warn(text: str) -> None:
     """Print a warning on stderr."""
-    click.secho(wrapped(f"warning: {text}", sys.stderr), fg="yellow", err=True)
+    click.secho(wrapped(f"warning: {harmless(text)}", sys.stderr), fg="yellow", err=True)
 
 
 def warn_of(findings: Iterable[Finding]) -> None:
@@ -191,6 +191,11 @@ def progress_bar(title: str) -> Iterator[ProgressBar]:
     console = Console(stderr=True)
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield ProgressBar(bar, title)
+
+
+def harmless(text: str) -> str:
+    """Write a stranger's control characters as escapes, so that a terminal does not obey them."""
+    return "".join(each if each.isprintable() or each in "\n\t" else repr(each)[1:-1] for each in text)
 
 
 def escape(text: str) -> str:

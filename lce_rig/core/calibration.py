@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 import lce_rig
+from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Finding, Refusal
@@ -606,7 +607,7 @@ def read_result(path: Path | str) -> ResultFile:
     if not path.exists():
         raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
     again = "Run `lce-rig calibrate SESSION` again."
-    with reading(path, SessionError, again):
+    with reading(path, SessionError, again, MAX_BYTES):
         try:
             return _file().validate_json(path.read_bytes())
         except ValidationError as error:

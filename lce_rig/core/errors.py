@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from lce_rig.core.bounds import require_file
 from lce_rig.core.findings import Finding, Kind, Refusal, Stage
 from lce_rig.core.phrasing import as_line
 
@@ -97,23 +98,30 @@ class CommandError(LceRigError):
 
 
 @contextmanager
-def reading(path: Path | str, kind: type[LceRigError] = SourceError, hint: str = "") -> Iterator[None]:
+def reading(
+    path: Path | str, kind: type[LceRigError] = SourceError, hint: str = "", most_bytes: int | None = None
+) -> Iterator[None]:
     """Turn any failure to read a file into one error that names the file.
+
+    Devices, pipes and files that are too large are refused before they are opened.
 
     Libraries raise whatever their code meets in a damaged file: KeyError, struct.error, RuntimeError and
     errors of their own. An LceRigError passes: it names its cause already.
 
     Args:
-        path: the file, for the message.
+        path: the file, or words for the message.
         kind: of the error.
         hint: an action against content that is damaged or of another kind.
+        most_bytes: largest size of a file that is read at once.
     """
     try:
+        if isinstance(path, Path):
+            require_file(path, most_bytes)
         yield
     except LceRigError:
         raise
     except MemoryError as error:
-        raise kind(f"{path}: does not fit into the memory that is free", hint) from error
+        raise kind(f"{path}: needs more memory than one file may take", hint) from error
     except OSError as error:
         raise kind(f"{path}: cannot be read: {reason_of(error)}") from error
     except Exception as error:

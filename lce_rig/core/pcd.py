@@ -181,7 +181,7 @@ def _read_compressed(body: bytes, header: _Header) -> NDArray[Any]:
     there, n_needed = body[8 : 8 + n_packed], header.n_points * header.dtype.itemsize
     if len(there) < n_packed:
         raise ValueError(f"it is truncated: {len(there)} of {n_packed} compressed bytes are there")
-    if n_bytes < n_needed or n_needed > _MAX_EXPANSION * len(there):
+    if n_bytes < n_needed or n_bytes > _MAX_EXPANSION * len(there):
         n_there = min(n_bytes, _MAX_EXPANSION * len(there)) // header.dtype.itemsize
         raise ValueError(f"it is truncated: {n_there} of {header.n_points} points are there")
     try:

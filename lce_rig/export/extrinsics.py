@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError, reading
@@ -120,7 +121,7 @@ def read_reference(path: Path | str) -> Reference:
         SessionError: there is none, or it is not a rigid transform.
     """
     path = Path(path)
-    with reading(path, SessionError):
+    with reading(path, SessionError, most_bytes=MAX_BYTES):
         document = read_json(path)
     if not isinstance(document, dict):
         raise SessionError(f"{path}: holds no T_cam_lidar")

@@ -15,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import SessionError, SourceError, reading
 from lce_rig.core.geometry import pose
@@ -126,7 +127,7 @@ def read_robot_urdf(path: Path) -> RobotTree:
 
 
 def _read(path: Path) -> bytes:
-    with reading(path, SessionError):
+    with reading(path, SessionError, most_bytes=MAX_BYTES):
         return path.read_bytes()
 
 

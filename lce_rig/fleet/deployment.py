@@ -7,14 +7,14 @@ makes an earlier release current again. Each opens its own connections; nothing 
 import difflib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from lce_rig.core.calibration import ResultFile, read_result
+from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import (
     CommandError,
     LceRigError,
@@ -22,14 +22,18 @@ from lce_rig.core.errors import (
     TargetError,
 )
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.export import export
 from lce_rig.fleet.findings import (
     DEPLOY_FAILED,
+    DEPLOY_MOVED,
+    DEPLOY_NO_ROBOT,
     DEPLOY_OLDER,
+    DEPLOY_OTHER_RIG,
     DEPLOY_OTHER_ROBOT,
     DEPLOY_OTHER_SERIAL,
     DEPLOY_UNDATED,
+    DEPLOY_WORSE,
 )
 from lce_rig.fleet.place import (
     CHANGED,
@@ -57,6 +61,8 @@ from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 
+# Largest movement without a reason, of pairs whose profile states none: defaults of `nominal_extrinsics`.
+_TOLERANCE_DEG, _TOLERANCE_M = 5.0, 0.1
 _OTHER = "Another deployment came first. Run the same command again."
 
 
@@ -68,6 +74,7 @@ class SensorChange:
         camera, lidar: the sensors.
         is_new: whether the new set has extrinsics of them.
         rotation_deg, translation_m: between both sets; None if only one of them has extrinsics.
+        verdict, verdict_there: of the new and the deployed result; "" where there is none.
     """
 
     camera: str
@@ -75,6 +82,8 @@ class SensorChange:
     is_new: bool
     rotation_deg: float | None = None
     translation_m: float | None = None
+    verdict: str = ""
+    verdict_there: str = ""
 
 
 @dataclass(frozen=True)
@@ -159,6 +168,7 @@ def deploy(
     session: Session | None = None,
     reason: str = "",
     place: Place | None = None,
+    announce: Callable[[Plan], None] | None = None,
 ) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
@@ -172,6 +182,7 @@ def deploy(
         session: with images and scans, for formats that show them.
         reason: for deploying it against objections; it is written down there.
         place: another way to the target's folder than the target's own.
+        announce: receives the changes before anything is refused or changed.
 
     Raises:
         SessionError: there is no result.
@@ -182,6 +193,8 @@ def deploy(
     place = place or Place(target)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         planned = _plan(result, rig, target, session, place, Path(folder))
+        if announce is not None:
+            announce(planned)
         if planned.objections and not reason:
             causes = "; ".join(finding.text for finding in planned.objections)
             at = "SESSION" if session is None else str(session.path)
@@ -278,15 +291,14 @@ def _plan(
     saved = _stage(result, rig, target, session, new)
     state = _standing(place, deployed)
     files = content_of(new)
-    before, after = _extrinsics(deployed), _extrinsics(new)
-    sensors = [
-        SensorChange(*key, True, *tangent_sizes(difference(after[key], before[key])))
-        if key in before and key in after
-        else SensorChange(*key, key in after)
-        for key in dict.fromkeys([*after, *before])
-    ]
+    rig_there, before = _pairs(deployed)
+    after = {(pair.camera, pair.lidar): pair for pair in saved.pairs}
+    sensors = [_change(key, after.get(key), before.get(key)) for key in dict.fromkeys([*after, *before])]
     changed = differences(files, {} if state.current is None else state.current.files)
     findings = _compare(saved, target, state.current)
+    if rig_there not in ("", saved.rig):
+        findings.append(DEPLOY_OTHER_RIG(rig=saved.rig, there=rig_there))
+    findings += [finding for change in sensors for finding in _object(change, rig)]
     record = ReleaseRecord.of(saved, files, state)
     lines = [line for name in changed for line in _diff(name, deployed, new)]
     return Plan(record, state, changed, tuple(sensors), tuple(findings), tuple(lines))
@@ -323,6 +335,8 @@ def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord |
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
     for robot in sorted(robots - {origin.robot}) if origin.robot else ():
         findings.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
+    if robots and not origin.robot:
+        findings.append(DEPLOY_NO_ROBOT(there=", ".join(sorted(robots))))
     if current is None:
         return findings
     for sensor, serial in sorted(origin.serials.items()):
@@ -338,10 +352,40 @@ def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord |
     return findings
 
 
-def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
+def _pairs(folder: Path) -> tuple[str, dict[tuple[str, str], Calibration]]:
+    """Read the rig's name and the calibrations of a set; none where it has no result."""
     with suppress(LceRigError):
-        return {(c.camera, c.lidar): c.T_cam_lidar for c in read_result(folder / RESULT).pairs}
-    return {}
+        saved = read_result(folder / RESULT)
+        return saved.rig, {(pair.camera, pair.lidar): pair for pair in saved.pairs}
+    return "", {}
+
+
+def _change(key: tuple[str, str], new: Calibration | None, old: Calibration | None) -> SensorChange:
+    change = SensorChange(
+        *key,
+        new is not None,
+        verdict="" if new is None else new.verdict,
+        verdict_there="" if old is None else old.verdict,
+    )
+    if new is None or old is None:
+        return change
+    rotation_deg, translation_m = tangent_sizes(difference(new.T_cam_lidar, old.T_cam_lidar))
+    return replace(change, rotation_deg=rotation_deg, translation_m=translation_m)
+
+
+def _object(change: SensorChange, rig: Rig) -> list[Finding]:
+    """List objections to the change of a sensor: moved beyond the profile's tolerance, a worse verdict."""
+    findings, subject = list[Finding](), f"{change.camera} and {change.lidar}"
+    if change.rotation_deg is not None and change.translation_m is not None:
+        nominal = rig.nominal(change.camera, change.lidar)
+        limit_deg = _TOLERANCE_DEG if nominal is None else nominal.tolerance_deg
+        limit_m = _TOLERANCE_M if nominal is None else nominal.tolerance_m
+        if change.rotation_deg > limit_deg or change.translation_m > limit_m:
+            moved = {"rotation_deg": change.rotation_deg, "translation_m": change.translation_m}
+            findings.append(DEPLOY_MOVED(subject, **moved, limit_deg=limit_deg, limit_m=limit_m))
+    if (change.verdict_there, change.verdict) == ("pass", "marginal"):
+        findings.append(DEPLOY_WORSE(subject, verdict=change.verdict, there=change.verdict_there))
+    return findings
 
 
 def _commit(

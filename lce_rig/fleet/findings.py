@@ -66,6 +66,26 @@ DEPLOY_OTHER_ROBOT = Kind(
     "the result is of robot {robot}, the target of {there}",
     "Name the target of the right robot.",
 )
+DEPLOY_NO_ROBOT = Kind(
+    "deploy.no_robot",
+    "the result names no robot, the target is of {there}",
+    "Set `robot` in the profile and collect again.",
+)
+DEPLOY_OTHER_RIG = Kind(
+    "deploy.other_rig",
+    "the result is of rig {rig}, the deployed one of {there}",
+    "Name the target of the right rig.",
+)
+DEPLOY_MOVED = Kind(
+    "deploy.moved",
+    "{subject} would move by {rotation_deg:deg}, {translation_m:mm} (limit {limit_deg:deg}, {limit_m:mm})",
+    "Check the result, `lce-rig verify {session}`, or force it and say why.",
+)
+DEPLOY_WORSE = Kind(
+    "deploy.worse",
+    "the verdict of {subject} is {verdict}, the deployed one {there}",
+    "Improve the result, see `lce-rig calibrate {session}`.",
+)
 DEPLOY_OTHER_SERIAL = Kind(
     "deploy.other_serial",
     "{subject} has serial number {serial}, the deployed one {there}",

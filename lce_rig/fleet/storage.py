@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fsspec import get_filesystem_class
+from fsspec.archive import AbstractArchiveFileSystem
 from fsspec.core import url_to_fs
 
-from lce_rig.core.errors import LceRigError, SourceError, reason_of
+from lce_rig.core.bounds import MAX_BYTES, require_file
+from lce_rig.core.errors import LceRigError, SourceError, UsageError, reason_of
 from lce_rig.session.durable import copy_over, write_atomically
 
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
@@ -33,6 +36,23 @@ class Storage:
         text = str(place).removeprefix("file://")
         return cls(text.rstrip("/") if "://" in text else str(Path(text).resolve()))
 
+    def require_folder(self) -> "Storage":
+        """Return it, if a folder of results can be there.
+
+        Raises:
+            UsageError: it is a file or a device, an archive, or of an unknown kind.
+        """
+        if self.local is None:
+            try:
+                kind = get_filesystem_class(self.url.partition("://")[0])
+            except (ValueError, ImportError) as error:
+                raise UsageError(f"{self.url}: {reason_of(error)}", "Give a folder, or s3://...") from error
+            if issubclass(kind, AbstractArchiveFileSystem):
+                raise UsageError(f"{self.url}: an archive is not a folder", "Unpack it and give the folder.")
+        elif self.local.exists() and not self.local.is_dir():
+            raise UsageError(f"{self.url} is not a folder", "Give a folder, or an address such as s3://...")
+        return self
+
     def __truediv__(self, name: str) -> "Storage":
         return Storage(f"{self.url}/{name}")
 
@@ -55,7 +75,7 @@ class Storage:
             raise
         except Exception as error:
             raise SourceError(
-                f"{self.url} cannot be reached: {reason_of(error)}",
+                f"{self.url} cannot be reached: {reason_of(OSError(str(error)))}",
                 ""
                 if self.local is not None
                 else "Check the address, the credentials and the endpoint (docs/fleets.md#object-stores).",
@@ -70,6 +90,8 @@ class Storage:
         """Read it as a file; None if there is none."""
         try:
             with self.reached() as (fs, path):
+                if self.local is not None:
+                    require_file(self.local, MAX_BYTES)
                 return bytes(fs.cat_file(path))
         except _ABSENT:
             return None

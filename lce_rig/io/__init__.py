@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
 
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.io import findings as findings  # Readers may name their kinds by code.
 from lce_rig.io.recording import Recording, SourceOptions, choose_lidar
 from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
@@ -52,7 +52,8 @@ def recognise(path: Path) -> str:
     """
     if not path.exists():
         raise SourceError(f"{path} does not exist")
-    kind = kind_of(path)
+    with reading(path):
+        kind = kind_of(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
         hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."

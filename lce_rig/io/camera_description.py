@@ -247,9 +247,7 @@ def read_cameras(path: Path) -> CameraFile:
     Raises:
         ProfileError: it cannot be read, or describes no camera.
     """
-    with reading(path, ProfileError, f"Give {FORMS}."):
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError("too large to describe a camera")
+    with reading(path, ProfileError, f"Give {FORMS}.", _MAX_BYTES):
         data = path.read_bytes()
         # A topic that was echoed for long repeats its camera.
         for document in _documents(data):

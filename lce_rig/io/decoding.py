@@ -1,6 +1,7 @@
 """Images and point clouds from files, unchanged: no rotation by EXIF, no colour management."""
 
 import io
+import struct
 from collections.abc import Callable
 from importlib.util import find_spec
 from itertools import islice
@@ -10,12 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.bounds import MAX_BYTES, decoding
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.files import decode_pixels
 from lce_rig.core.pcd import decode_pcd
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 _MAX_SAMPLED = 1 << 24
+# Of LAS: minor version, bytes of the header, offset of points, number of records, bytes and number of points;
+# offset and number of extended records, number of points. Bytes of the head of a record.
+_LAS_HEADER, _LAS_14 = struct.Struct("<25xB68xHIIxHI"), struct.Struct("<235xQIQ")
+_VLR_BYTES, _EVLR_BYTES = 54, 60
 # Of PLY: by the names of its properties' types, and by its formats.
 _KINDS = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
@@ -34,7 +40,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SourceError: the file is missing, empty, truncated or no image.
     """
-    with reading(path):
+    with reading(path, most_bytes=MAX_BYTES), decoding():
         return decode_image(path.read_bytes())
 
 
@@ -135,6 +141,7 @@ def decode_las(data: bytes) -> NDArray[Any]:
     require_las()
     import laspy
 
+    _check_las(data)
     # Decompressors of LAZ abort the process on damaged files.
     cloud = laspy.read(io.BytesIO(data), laz_backend=())
     if len(cloud.points) != cloud.header.point_count:
@@ -147,6 +154,31 @@ def decode_las(data: bytes) -> NDArray[Any]:
     for name, column in columns.items():
         rows[name] = column
     return rows
+
+
+def _check_las(data: bytes) -> None:
+    """Compare the counts in a header with the size of the file; laspy loops over them.
+
+    Raises:
+        ValueError: the file is smaller than its header promises.
+
+    References:
+        ASPRS, LAS specification 1.4-R15, table 3.
+    """
+    if len(data) < _LAS_HEADER.size or not data.startswith(b"LASF"):
+        raise ValueError("it has no LAS header")
+    minor, header_bytes, points_at, n_vlrs, n_bytes, n_points = _LAS_HEADER.unpack_from(data)
+    evlrs_at, n_evlrs = 0, 0
+    if minor >= 4 and len(data) >= _LAS_14.size:
+        evlrs_at, n_evlrs, n_all = _LAS_14.unpack_from(data)
+        n_points = max(n_points, n_all)
+    needed = max(
+        header_bytes + _VLR_BYTES * n_vlrs,
+        points_at + n_bytes * n_points,
+        evlrs_at + _EVLR_BYTES * n_evlrs,
+    )
+    if needed > len(data):
+        raise ValueError(f"it is truncated: {len(data)} of at least {needed} bytes are there")
 
 
 def require_las() -> None:
@@ -175,5 +207,5 @@ def read_cloud(path: Path) -> NDArray[Any]:
     Raises:
         SourceError: the file is missing, empty, truncated or damaged.
     """
-    with reading(path):
+    with reading(path, most_bytes=MAX_BYTES), decoding():
         return DECODERS[path.suffix.lower()](path.read_bytes())

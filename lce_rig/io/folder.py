@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
@@ -190,7 +191,9 @@ def _folders(folder: Path) -> dict[str, Path]:
 
 
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and p.name[0] != "."]
+    visible = [p for p in folder.iterdir() if p.name[0] != "."]
+    # Links to devices are listed, for their reader to name.
+    found = [p for p in visible if p.suffix.lower() in suffixes and not p.is_dir()]
     return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
 
 
@@ -240,7 +243,7 @@ class PlacementOnDisk:
         sensors = [f"{file.sensor} {file.channel}".rstrip() for file in self.files]
         digest = hashlib.sha256(" ".join(sensors).encode())
         for file in self.files:
-            with reading(file.path):
+            with reading(file.path, most_bytes=MAX_BYTES):
                 digest.update(hashlib.sha256(file.path.read_bytes()).digest())
         return digest.hexdigest()
 

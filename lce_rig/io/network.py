@@ -10,6 +10,7 @@ from typing import Any
 
 import dpkt  # type: ignore[import-untyped]
 
+from lce_rig.core.bounds import BoundedPath
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
@@ -70,7 +71,7 @@ class PcapFile:
         if not path.is_file():
             raise SourceError(f"{path}: not a file")
         hint = "Record the card that the LiDAR is on (tcpdump -i eth0 -w FILE); unpack a packed file first."
-        with reading(path, hint=hint), path.open("rb") as file:
+        with reading(path, hint=hint), BoundedPath(path).open("rb") as file:
             self._link = dpkt.pcap.UniversalReader(file).datalink()
             if self._link not in _FRAMES:
                 raise ValueError(f"recorded from a link of type {self._link}, which is not read")
@@ -79,7 +80,7 @@ class PcapFile:
         """Yield the whole UDP datagrams in the order of recording, up to where the file is damaged."""
         self.losses = Losses()
         self.damage = ""
-        with self.path.open("rb") as file:
+        with BoundedPath(self.path).open("rb") as file:
             try:
                 for stamp_s, raw in dpkt.pcap.UniversalReader(file):
                     # dpkt gives stamps of ns as exact decimals and others as floats, which hold a us.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from lce_rig.core.data import Events, Sample, Stream
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
 from lce_rig.io.findings import CLOCK_SET_BACK, OUT_OF_ORDER
 from lce_rig.rig import Rig
@@ -93,7 +93,7 @@ def fingerprint(files: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for file in files:
         size = file.stat().st_size
-        with file.open("rb") as stream:
+        with reading(file), file.open("rb") as stream:
             head = stream.read(_END_BYTES)
             stream.seek(max(size - _END_BYTES, 0))
             digest.update(f"{file.name} {size}".encode() + head + stream.read(_END_BYTES))

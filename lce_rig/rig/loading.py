@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from yaml.constructor import ConstructorError
 
 from lce_rig.core.board import Board
+from lce_rig.core.bounds import MAX_TEXT_BYTES
 from lce_rig.core.errors import ProfileError, reading
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.profile import Rig
@@ -91,7 +92,7 @@ def read_profile(path: Path) -> str:
     Raises:
         ProfileError: it cannot be read, or is not text.
     """
-    with reading(path, ProfileError):
+    with reading(path, ProfileError, most_bytes=MAX_TEXT_BYTES):
         try:
             return path.read_text(encoding="utf-8")
         except UnicodeDecodeError:

@@ -91,11 +91,11 @@ def rig():
 def result(tmp_path):
     """Write the result of a calibration into a folder of its own."""
 
-    def write(name="a", x_m=0.12, origin=ORIGIN, **changes):
+    def write(name="a", x_m=0.12, origin=ORIGIN, rig_name="rles", **changes):
         folder = tmp_path / f"result-{name}"
         folder.mkdir()
         pair = calibration(some_pose(t=(x_m, -0.07, -0.08)), **changes)
-        (folder / "result.json").write_text(result_file("rles", [pair], provenance=origin).text())
+        (folder / "result.json").write_text(result_file(rig_name, [pair], provenance=origin).text())
         return folder
 
     return write

@@ -90,6 +90,10 @@ def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(result, rig, ta
     [
         ({"verdict": "fail"}, "deploy.failed"),
         ({"origin": replace(ORIGIN, robot="heron")}, "deploy.other_robot"),
+        ({"origin": replace(ORIGIN, robot="")}, "deploy.no_robot"),
+        ({"verdict": "marginal"}, "deploy.worse"),
+        ({"x_m": 0.12 + 0.061}, "deploy.moved"),
+        ({"rig_name": "rlfs"}, "deploy.other_rig"),
         ({"origin": replace(ORIGIN, serials={"lidar": "AG2"})}, "deploy.other_serial"),
         ({"origin": replace(ORIGIN, date="2026-11-19T10:22:03Z")}, "deploy.older"),
     ],
@@ -114,13 +118,24 @@ def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(re
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
     unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))
-    assert codes(plan(unknown, rig, named)) == []
-    deploy(unknown, rig, named)
+    assert codes(plan(unknown, rig, named)) == ["deploy.no_robot"]
+    assert codes(plan(unknown, rig, local)) == []
+    deploy(unknown, rig, local)
     dated = plan(result("c"), rig, local)
     assert codes(dated) == []
     assert [finding.code for finding in dated.remarks] == ["deploy.undated"]
     assert deploy(result("e"), rig, local).remarks == dated.remarks
     assert plan(result("d", 0.1), rig, local).remarks == ()
+
+
+def test_deploy_announces_movement_and_verdict_first(result, rig, local):
+    deploy(result("a", verdict="marginal"), rig, local)
+    announced = []
+    with pytest.raises(ResultRefusedError, match=r"would move by .* 80 mm \(limit"):
+        deploy(result("b", 0.2), rig, local, announce=announced.append)
+    (change,) = announced[0].sensors
+    assert (change.verdict_there, change.verdict) == ("marginal", "pass")
+    assert change.translation_m == pytest.approx(0.08)
 
 
 def test_formats_are_chosen(result, rig, local, robot):
@@ -158,7 +173,7 @@ class Meanwhile(Place):
 
 def test_of_two_deployments_at_once_one_is_refused(result, rig, local, robot):
     deploy(result("a"), rig, local)
-    folder, other = result("b", 0.15), result("c", 0.2)
+    folder, other = result("b", 0.15), result("c", 0.16)
 
     with pytest.raises(TargetError):
         deploy(folder, rig, local, place=Meanwhile(local, lambda _: deploy(other, rig, local)))
@@ -175,7 +190,7 @@ def test_files_that_the_disk_does_not_give_back_are_not_made_current(result, rig
     with pytest.raises(TargetError, match=r"rles\.urdf"):
         deploy(result("b", 0.15), rig, local, place=Meanwhile(local, damage))
     assert standing(local).current == first
-    deploy(result("c", 0.2), rig, local)
+    deploy(result("c", 0.16), rig, local)
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
 
 
@@ -233,15 +248,15 @@ def test_only_own_releases_are_removed_and_only_after_the_switch(result, rig, lo
         deploy(result("failed", 0.13, verdict="fail"), rig, few)
     assert tree(robot) == before
     assert [release.name for release in standing(few).releases] == [first.name]
-    names = [deploy(result(f"{k}", 0.2 + 0.01 * k), rig, few).release.name for k in range(3)]
+    names = [deploy(result(f"{k}", 0.16 + 0.01 * k), rig, few).release.name for k in range(3)]
     assert sorted(path.name for path in (robot / "releases").iterdir()) == sorted([*others, *names[1:]])
 
 
 def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(result, rig, local, robot):
     few = with_settings(local, keep=2)
-    first, _ = (deploy(result(name, x_m), rig, few).release for name, x_m in (("a", 0.1), ("b", 0.2)))
+    first, _ = (deploy(result(name, x_m), rig, few).release for name, x_m in (("a", 0.1), ("b", 0.12)))
     rollback(few)
-    third = deploy(result("c", 0.3), rig, few).release
+    third = deploy(result("c", 0.14), rig, few).release
     assert [release.name for release in standing(few).releases] == [third.name, first.name]
     assert rollback(few).release == first
 
@@ -277,7 +292,7 @@ def test_a_robot_without_flock_is_deployed_to(result, rig, local, robot, tmp_pat
     for name in ("sh", *TOOLS, "cut", "du", "find", "tail", "true"):
         if name != "flock":
             (place.tools / name).symlink_to(str(shutil.which(name)))
-    for name, x_m in (("a", 0.1), ("b", 0.2)):
+    for name, x_m in (("a", 0.1), ("b", 0.12)):
         assert deploy(result(name, x_m), rig, with_settings(local, run="true"), place=place).is_new
     assert not (robot / ".lock").exists() and not standing(local).changed
 
@@ -351,5 +366,5 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(result, ri
         assert content_of(robot / "current") == before
         assert {entry.name for entry in robot.glob(".*")} <= {".lock", ".current.new"}, f"step {n}"
     assert n > 15 and n_new > 2 and n_old > 2
-    deploy(result("c", 0.2), rig, settings, place=sound)
+    deploy(result("c", 0.16), rig, settings, place=sound)
     assert len(list((robot / "releases").glob(f"*/{RECORD}"))) == 2

@@ -4,16 +4,21 @@ rosbags' readers of single files are used, not its AnyReader: that one parses ev
 bag, and refuses the whole bag for one that it cannot parse or for older bags without any.
 """
 
+import os
 import shutil
 import sys
+from bz2 import BZ2Decompressor
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import cache, partial
 from heapq import merge
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from lce_rig.core.bounds import MAX_CHUNK_BYTES, BoundedPath, Unpacking, unpack
 from lce_rig.core.errors import SourceError, reading, reason_of
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -91,7 +96,7 @@ class BagFile:
                     # Without its metadata.yaml a bag does not say that each message is compressed; CDR begins
                     # with a zero.
                     if encoding != "ros1" and data.startswith(_ZSTD_MAGIC):
-                        data = _zstd().decompress(data)
+                        data = unpack(_zstd().ZstdDecompressor, data)
                     yield RawMessage(connection.topic, _type_of(connection), encoding, int(log_ns), data)
                     n_read += 1
             except Exception as error:
@@ -108,6 +113,7 @@ class BagFile:
         from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
 
+        _bound_rosbags()
         # A folder's metadata.yaml names its files; without it each file is opened for itself.
         is_described = self.path.is_dir() and (self.path / "metadata.yaml").is_file()
         self.damages.clear()
@@ -116,9 +122,7 @@ class BagFile:
             for file in [self.path] if is_described else self.files:
                 try:
                     with reading(file, hint=_repair(file)):
-                        if not (is_described or file.is_file()):
-                            raise ValueError("it is not a file")
-                        plain = file if is_described else stack.enter_context(_plain(file))
+                        plain = BoundedPath(file) if is_described else stack.enter_context(_plain(file))
                         is_ros1 = not is_described and kind_of(file) == ".bag"
                         reader = Ros1Reader(plain) if is_ros1 else Ros2Reader(plain)
                         readers.append(stack.enter_context(reader))
@@ -156,11 +160,15 @@ def _plain(file: Path) -> Iterator[Path]:
     """
     kind = kind_of(file)
     with TemporaryDirectory() as folder:
-        plain = Path(folder) / f"bag{kind}"
+        plain = BoundedPath(folder) / f"bag{kind}"
         if file.suffix.lower() in _COMPRESSED:
             try:
-                with _zstd().open(file, "rb") as compressed, plain.open("wb") as target:
-                    shutil.copyfileobj(compressed, target)
+                with (
+                    file.open("rb") as packed,
+                    _open_unpacked(packed, "rb") as unpacked,
+                    plain.open("wb") as target,
+                ):
+                    shutil.copyfileobj(unpacked, target)
             except (_zstd().ZstdError, EOFError):
                 raise ValueError("it is truncated, or not compressed by zstd") from None
         else:
@@ -169,6 +177,38 @@ def _plain(file: Path) -> Iterator[Path]:
             if not opened.read(16).startswith(_MAGIC[kind]):
                 raise ValueError(f"its content is not that of a {kind} file")
         yield plain
+
+
+@cache
+def _bound_rosbags() -> None:
+    """Let rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
+
+    Its tables of decompressors are replaced: they unpack whatever a chunk holds, before its size is checked.
+    """
+    lz4 = import_module("lz4.frame")
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
+    from rosbags.rosbag2 import storage_mcap
+
+    makers = {
+        "bz2": BZ2Decompressor,
+        "lz4": lz4.LZ4FrameDecompressor,
+        "zstd": _zstd().ZstdDecompressor,
+    }
+    ros1.decompressors |= {name: partial(unpack, makers[name]) for name in ("bz2", "lz4")}
+
+    def unpack_chunk(name: str, packed: bytes, size: int) -> bytes:
+        if size > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk claims {size / 1e6:.0f} MB (limit {MAX_CHUNK_BYTES / 1e6:.0f} MB)")
+        return unpack(makers[name], packed, size)
+
+    storage_mcap.DECOMPRESSORS |= {name: partial(unpack_chunk, name) for name in ("lz4", "zstd")}
+    bounded = SimpleNamespace(decompress=partial(unpack, makers["zstd"]), open=_open_unpacked)
+    vars(ros2)["zstd"] = bounded
+
+
+def _open_unpacked(packed: Any, _mode: str) -> Unpacking:
+    return Unpacking(_zstd().open(packed, "rb"), os.fstat(packed.fileno()).st_size)
 
 
 def _zstd() -> Any:

@@ -2,9 +2,11 @@
 
 import asyncio
 import hmac
+import ipaddress
 import json
 import math
 import re
+import socket
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +14,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from importlib import resources
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -306,6 +309,9 @@ class Pages:
             # Without the connection, strangers ask no faster than they are accepted.
             answer.force_close()
             return answer
+        origin = request.headers.get("Origin", f"http://{request.host}")
+        if not _is_address(request.host) or origin != f"http://{request.host}":
+            return web.Response(status=403, text="This page answers to its own address only.\n")
         return await handler(request)
 
     async def _file(self, request: web.Request) -> web.Response:
@@ -335,6 +341,19 @@ class Pages:
         # Cookies are shared between the ports of a host.
         address = request.transport.get_extra_info("sockname") if request.transport else ("", 0)
         return f"{_COOKIE}_{address[1]}"
+
+
+def _is_address(host: str) -> bool:
+    """Return whether a Host names this computer by address or own name; other names may be rebound to it."""
+    name = urlsplit(f"//{host}").hostname or ""
+    own = socket.gethostname().lower()
+    if name in ("localhost", own, f"{own}.local"):
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:

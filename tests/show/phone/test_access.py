@@ -1,3 +1,4 @@
+import http.client
 import re
 
 import aiohttp
@@ -5,7 +6,7 @@ import pytest
 
 from lce_rig.show.phone.preview import Preview
 
-from .conftest import state
+from .conftest import port_of, state
 from .watcher import Watcher
 
 FILES = ("", "page.css", "page.js", "stage.js", "live", "nothing-here")
@@ -60,3 +61,22 @@ def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(previe
 def test_only_files_of_the_page_are_served(preview, path):
     with Watcher(preview.urls[0]) as watcher:
         assert watcher.get(path)[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:1"}, 200),
+        ({"Host": "rebound.example"}, 403),
+        ({"Host": "rebound.example", "Origin": "http://rebound.example"}, 403),
+        ({"Host": "localhost:1", "Origin": "http://localhost:1"}, 200),
+        ({"Host": "localhost:1", "Origin": "http://elsewhere.example"}, 403),
+    ],
+)
+def test_guard_answers_its_own_address_only(headers, status):
+    with Preview(port=0, token="abcdefgh") as preview:
+        line = http.client.HTTPConnection("127.0.0.1", port_of(preview), timeout=10)
+        line.request("GET", "/?token=abcdefgh", headers=headers)
+        assert line.getresponse().status == status
+        line.close()
