@@ -1,0 +1,91 @@
+"""Two cameras and two LiDARs estimated as one: truth, closed loops, and which sensor is named."""
+
+import numpy as np
+import pytest
+
+from lce_rig.core.geometry import difference, perturb
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
+from tests.calibrate.boards import in_use
+from tests.calibrate.four_sensors import ON_FRONT, between, make_rig, simulate
+
+N = 30
+RIG = make_rig()
+
+
+def calibrate(detections):
+    return {(c.camera, c.lidar): c for c in calibrate_detections(RIG, detections)[0]}
+
+
+def error(result):
+    T = result.T_cam_lidar
+    if result.intrinsics is not None:
+        T = in_use(T, result.intrinsics)
+    return difference(T, between(result.camera, result.lidar))
+
+
+def causes(results):
+    """Texts of the causes by pair."""
+    return {
+        pair: [f.text for f in c.findings if f.severity != "note" and not f.follows]
+        for pair, c in results.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return calibrate(simulate(N, 0))
+
+
+def test_four_sensors_poses_are_within_their_claims(sound):
+    assert len(sound) == 5
+    for result in sound.values():
+        assert result.verdict == "pass", result.findings
+        off = error(result)
+        assert off @ np.linalg.solve(result.cov, off) < 25
+        assert np.degrees(np.linalg.norm(off[3:])) < 0.12 and np.linalg.norm(off[:3]) < 0.01
+        assert len(result.estimated_with) == 2
+
+
+def test_four_sensors_loops_close(sound):
+    T = {pair: c.T_cam_lidar for pair, c in sound.items()}
+    for camera in ("left", "right"):
+        closed = T[camera, "front"] @ T["front", "rear"]
+        assert np.allclose(closed, T[camera, "rear"], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["right", "rear"])
+def test_sensor_that_moved_is_named_and_others_pass(name):
+    after = perturb(ON_FRONT[name], np.r_[0.01, 0.0, 0.01, np.radians([0.6, 0.0, 0.8])])
+    moves = {name: lambda k: ON_FRONT[name] if k < N // 2 else after}
+    results = calibrate(simulate(N, 2, moves=moves))
+    for pair, texts in causes(results).items():
+        if name in pair:
+            assert results[pair].verdict == "fail"
+            assert len(texts) == 1 and f"{name} moved" in texts[0]
+        else:
+            assert results[pair].verdict == "pass"
+
+
+def test_exchanged_lidars_are_named_in_all_pairs():
+    found = simulate(N, 1)
+    front, rear = found.lidars["front"], found.lidars["rear"]
+    results = calibrate(Detections(found.images, {"front": rear, "rear": front}))
+    for texts in causes(results).values():
+        assert len(texts) == 1 and "front and rear are exchanged" in texts[0]
+
+
+@pytest.mark.slow
+def test_four_sensors_claims_cover_errors_of_many_sessions():
+    """50 sessions of 30 placements, each seen by two or three of four sensors."""
+    chi2, sizes = [], []
+    for seed in range(50):
+        for result in calibrate(simulate(N, seed)).values():
+            off = error(result)
+            chi2.append(off @ np.linalg.solve(result.cov, off))
+            sizes.append([np.degrees(np.linalg.norm(off[3:])), 1e3 * np.linalg.norm(off[:3])])
+    rms_deg, rms_mm = np.sqrt(np.mean(np.square(sizes), axis=0))
+    covered = np.mean(np.array(chi2) < 12.59)
+    print(f"{len(chi2)} poses: rms {rms_deg:.3f} deg, {rms_mm:.1f} mm; {covered:.1%} within 95 %")
+    assert rms_deg < 0.06 and rms_mm < 4.0
+    assert covered > 0.92
