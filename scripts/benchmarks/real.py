@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +10,20 @@ import numpy as np
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import EstimateSettings
-from lce_rig.core.calibration import Method
+from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.reach import as_used
 from lce_rig.judge.repeatability import compare_calibrations
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
 
 # 95 % of the chi-squared distribution with six degrees of freedom.
 _CHI2_95 = 12.59
+# Sessions of one rig: rlfs03 is of another day.
+_ONE_RIG = ("rlfs01", "rlfs02", "rlfs03")
 
 
 def bench_real(n_splits: int, only: str, method: Method) -> None:
@@ -26,6 +31,7 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
     head = "set, captures, image, LiDAR, used, EGT deg / mm, halves deg / mm, chi2 / 6, in 95 %, MGE mm"
     print_head(*head.split(", "), "reported deg / mm", "verdict")
     clocks: list[tuple[object, ...]] = []
+    of_one_rig: dict[str, Calibration] = {}
     for recorded in SETS:
         if recorded.is_there and only in recorded.name:
             with tempfile.TemporaryDirectory() as scratch:
@@ -36,6 +42,15 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
                 print_row(*_row(recorded, rig, detections, channels, n_splits, method))
             if len(recorded.folders) > 1:
                 clocks += _clock_rows(recorded, rig, detections)
+            if recorded.name in _ONE_RIG:
+                of_one_rig[recorded.name] = calibrate_detections(rig, detections, EstimateSettings(method))[
+                    0
+                ][0]
+    if len(of_one_rig) > 1:
+        print()
+        print_head("sessions of one rig", "apart deg / mm", "boards apart mm, rms")
+        for (name, first), (other, second) in combinations(of_one_rig.items(), 2):
+            print_row(f"{name}, {other}", *_apart(first, second))
     if clocks:
         print()
         print_head("set", "channel", "captures", "corner noise px", "time offset ms")
@@ -122,6 +137,16 @@ def _halves(
             continue
         compared = compare_calibrations(dict(zip(("first", "second"), results, strict=True)))
         yield compared.max_rotation_deg, compared.max_translation_m, compared.chi2
+
+
+def _apart(first: Calibration, second: Calibration) -> tuple[str, str]:
+    """Compare two results as they draw points: their difference, and how far apart they place boards."""
+    lens = first.intrinsics
+    T = [c.T_cam_lidar if lens is None else as_used(c, lens) for c in (first, second)]
+    boards = [o.lidar.T_lidar_board[:3, 3] for c in (first, second) for o in c.observations.values()]
+    moved = transform(T[0], np.array(boards)) - transform(T[1], np.array(boards))
+    rms_m = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+    return "{:.3f} / {:.1f}".format(*compare(T[0], T[1])), f"{1000 * rms_m:.1f}"
 
 
 def _only(detections: Detections, names: set[str]) -> Detections:

@@ -102,10 +102,11 @@ def only(camera):
     return type(RIG).model_validate(data)
 
 
-def test_cameras_without_a_common_board_stay_by_themselves(session):
+def test_cameras_without_a_common_board_share_the_lidar(session):
     found = calibrated(detections(session, left=range(6), right=range(6, 12)), ML)
-    for own in found.values():
-        assert own.estimated_with == own.other_cameras == ()
+    for name, own in found.items():
+        assert own.estimated_with == tuple({LEFT, RIGHT} - {name})
+        assert own.other_cameras == ()
 
 
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
