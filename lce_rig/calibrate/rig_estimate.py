@@ -16,7 +16,7 @@ from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Layout, State
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES
-from lce_rig.calibrate.likelihood.rays import interior, spread, stack_scans
+from lce_rig.calibrate.likelihood.rays import StackedScans, interior, spread, stack_scans
 from lce_rig.calibrate.likelihood.rig import RigEstimate, maximise_rig, relate
 from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import jackknife_scatter
@@ -98,71 +98,45 @@ def estimate_rig(
     lenses = {camera: _lens_of(camera, cameras) for camera in of_cameras}
     seen = list(_list_seen(cameras, between, lenses))
     conflicts = _conflicts(seen)
-    seen = [each for each in seen if each.capture not in conflicts]
-    frame_of = _number_frames(seen)
-    F = max(frame_of.values()) + 1
-    boards: dict[str, dict[int, LidarBoard]] = {name: {} for name in of_lidars}
-    images: dict[str, dict[int, ImageBoard]] = {name: {} for name in of_cameras}
-    for each in seen:
-        frame = frame_of[each.capture]
-        for name, found in each.boards.items():
-            boards[name].setdefault(frame, found)
-        if each.image is not None:
-            images[each.pair[0]].setdefault(frame, each.image)
+    frames = _Frames.of([each for each in seen if each.capture not in conflicts], of_cameras, of_lidars)
     T_start = _spanning_poses(cameras, between, of_lidars[0])
-    T_base_board = _place_frames(F, boards, images, T_start)
-    stacked = [
-        stack_images(
-            np.array(sorted(images[name])),
-            [images[name][frame] for frame in sorted(images[name])],
-            board.pattern_offset_m,
-            lenses[name],
-        )
-        for name in of_cameras
-    ]
-    scans, donors = [], [_donor(name, cameras, between) for name in of_lidars]
-    for name in of_lidars:
-        frames = sorted(boards[name])
-        own = stack_scans([interior(boards[name][frame], board) for frame in frames], board)
-        scans.append(spread(own, np.array(frames), F))
-    stacked, image_levels = _weigh_cameras(of_cameras, stacked, cameras)
-    T_lidar_base = np.array([T_start[name] for name in of_lidars])
+    T_base_board = frames.place(T_start)
+    images, image_levels = _weigh_cameras(
+        of_cameras, [frames.stack_images(name, board, lenses[name]) for name in of_cameras], cameras
+    )
+    scans = [frames.stack_scans(name, board) for name in of_lidars]
+    donors = [_donor(name, cameras, between) for name in of_lidars]
     states: list[State] = []
-    for m, (scan, donor) in enumerate(zip(scans, donors, strict=True)):
-        n_optics = [] if m else [each.turns.shape[1] for each in stacked]
-        layout = Layout(n_optics, len(scan.rings))
+    for name, scan, donor in zip(of_lidars, scans, donors, strict=True):
+        T_cam = np.array([T_start[each] for each in of_cameras if not states]).reshape(-1, 4, 4)
+        layout = Layout([] if states else [each.turns.shape[1] for each in images], len(scan.rings))
         z = donor.state.common_to(layout, donor.terms.scans.rings, scan.rings)
-        if m:
+        if states:
             base = states[0]
-            z[layout.z["bow"]] = base.z[base.layout.z["bow"]]
-            z[layout.plate] = base.z[base.layout.plate]
-        T_cam = np.array([] if m else [T_start[name] for name in of_cameras]).reshape(-1, 4, 4)
-        states.append(State(layout, T_cam, T_lidar_base[m] @ T_base_board, np.zeros(F), z))
+            z[layout.shape] = base.z[base.layout.shape]
+        states.append(State(layout, T_cam, T_start[name] @ T_base_board, np.zeros(frames.n), z))
     joint = maximise_rig(
         scans,
-        stacked,
+        images,
         board,
         states,
-        T_lidar_base,
+        np.array([T_start[name] for name in of_lidars]),
         [replace(donor.levels, **image_levels) for donor in donors],
         [donor.priors for donor in donors],
         group_poses(T_base_board),
     )
     result = RigResult(of_cameras, of_lidars, {}, joint)
-    of_pairs: dict[SensorPair, CalibrationEstimate] = {}
+    estimates: dict[SensorPair, CalibrationEstimate] = {}
     for pair, alone in cameras.items():
         start = _start_of(alone, conflicts)
-        numbers = [frame_of[name] for name in alone.used if name in frame_of]
         T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
-        estimate = _report(result, pair[1], start, T, J, board, numbers)
-        optics = joint.terms.base.state.layout.optics(of_cameras.index(pair[0]))
-        of_lens = stacked[of_cameras.index(pair[0])].of_lens
-        of_pairs[pair] = replace(
-            estimate,
+        c = of_cameras.index(pair[0])
+        optics = joint.terms.base.state.layout.optics(c)
+        estimates[pair] = replace(
+            _report(result, pair[1], start, T, J, board, frames.numbers(start)),
             lens=lenses[pair[0]],
-            cov_with_lens=np.asarray(J @ joint.cov_z[:, optics] @ of_lens),
+            cov_with_lens=np.asarray(J @ joint.cov_z[:, optics] @ images[c].of_lens),
             joint=alone.joint,
-            estimated_with=tuple(sorted(held - set(pair))),
             same_scan=alone.same_scan,
             channels=alone.channels,
             channel_difference=alone.channel_difference,
@@ -170,14 +144,78 @@ def estimate_rig(
         )
     for pair, given in between.items():
         start = _start_of(given.start, conflicts)
-        numbers = [frame_of[o.capture] for o in start.observations if o.capture in frame_of]
         T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
-        R = np.kron(np.eye(2), given.T_view[:3, :3])
-        estimate = _report(result, pair[1], start, given.T_view @ T, R @ J, board, numbers, is_of_lidars=True)
-        of_pairs[pair] = replace(
-            estimate, joint=(given.joint, 0), estimated_with=tuple(sorted(held - set(pair)))
+        J = np.kron(np.eye(2), given.T_view[:3, :3]) @ J
+        estimates[pair] = replace(
+            _report(result, pair[1], start, given.T_view @ T, J, board, frames.numbers(start), True),
+            joint=(given.joint, 0),
         )
-    return replace(result, estimates=of_pairs)
+    with_names = {
+        pair: replace(estimate, estimated_with=tuple(sorted(held - set(pair))))
+        for pair, estimate in estimates.items()
+    }
+    return replace(result, estimates=with_names)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Boards and images of n placements in time: captures that hold the same scan are one.
+
+    Attributes:
+        n: how many.
+        of_capture: number of each capture's.
+        boards: by LiDAR and number.
+        images: by camera and number.
+    """
+
+    n: int
+    of_capture: Mapping[str, int]
+    boards: Mapping[str, Mapping[int, LidarBoard]]
+    images: Mapping[str, Mapping[int, ImageBoard]]
+
+    @classmethod
+    def of(cls, seen: Sequence[_Seen], cameras: Sequence[str], lidars: Sequence[str]) -> "_Frames":
+        of_capture = _number_frames(seen)
+        boards: dict[str, dict[int, LidarBoard]] = {name: {} for name in lidars}
+        images: dict[str, dict[int, ImageBoard]] = {name: {} for name in cameras}
+        for each in seen:
+            frame = of_capture[each.capture]
+            for name, found in each.boards.items():
+                boards[name].setdefault(frame, found)
+            if each.image is not None:
+                images[each.pair[0]].setdefault(frame, each.image)
+        return cls(max(of_capture.values()) + 1, of_capture, boards, images)
+
+    def numbers(self, start: Start) -> list[int]:
+        """List the numbers of an estimate's captures."""
+        return [self.of_capture[o.capture] for o in start.observations]
+
+    def stack_images(self, camera: str, board: Board, lens: SessionLens | None) -> StackedImages:
+        """Stack a camera's images."""
+        frames = sorted(self.images[camera])
+        found = [self.images[camera][frame] for frame in frames]
+        return stack_images(np.array(frames), found, board.pattern_offset_m, lens)
+
+    def stack_scans(self, lidar: str, board: Board) -> StackedScans:
+        """Stack a LiDAR's scans."""
+        frames = sorted(self.boards[lidar])
+        found = [interior(self.boards[lidar][frame], board) for frame in frames]
+        return spread(stack_scans(found, board), np.array(frames), self.n)
+
+    def place(self, T_start: Mapping[str, Array]) -> Array:
+        """Place the boards: T_base_board (n, 4, 4), by a camera where one saw it.
+
+        Args:
+            T_start: T_sensor_base (4, 4) of each sensor.
+        """
+        T = np.zeros((self.n, 4, 4))
+        for lidar, of_lidar in self.boards.items():
+            for frame, found in of_lidar.items():
+                T[frame] = invert(T_start[lidar]) @ found.T_lidar_board
+        for camera, of_camera in self.images.items():
+            for frame, image in of_camera.items():
+                T[frame] = invert(T_start[camera]) @ image.T_cam_board
+        return T
 
 
 def _report(
@@ -301,23 +339,6 @@ def _spanning_poses(
                     found[first] = T @ found[second]
                 break
     return found
-
-
-def _place_frames(
-    n: int,
-    boards: Mapping[str, Mapping[int, LidarBoard]],
-    images: Mapping[str, Mapping[int, ImageBoard]],
-    T_start: Mapping[str, Array],
-) -> Array:
-    """Place the board of each frame: T_base_board (n, 4, 4), by a camera where one saw it."""
-    T = np.zeros((n, 4, 4))
-    for lidar, of_lidar in boards.items():
-        for frame, found in of_lidar.items():
-            T[frame] = invert(T_start[lidar]) @ found.T_lidar_board
-    for camera, of_camera in images.items():
-        for frame, image in of_camera.items():
-            T[frame] = invert(T_start[camera]) @ image.T_cam_board
-    return T
 
 
 def _weigh_cameras(

@@ -129,6 +129,11 @@ class Layout:
         return self.z.of(["shifts"])[PLATE]
 
     @property
+    def shape(self) -> Indices:
+        """Places in z of the plate's bow, width and height (4,)."""
+        return np.concatenate([self.z.of(["bow"]), self.plate])
+
+    @property
     def lasers(self) -> Indices:
         """Places in z of the lasers' errors (3, L), in the order of `LASER`."""
         return self.z.of(LASER).reshape(len(LASER), -1)

@@ -29,7 +29,7 @@ from lce_rig.calibrate.likelihood.fit import (
     weigh_placements,
 )
 from lce_rig.calibrate.likelihood.images import StackedImages
-from lce_rig.calibrate.likelihood.layout import OWN, Indices, Layout, State
+from lce_rig.calibrate.likelihood.layout import OWN, Indices, State
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.model import (
     Known,
@@ -86,7 +86,7 @@ class RigTerms:
         for part, start in zip(self.parts, self.starts, strict=True):
             layout = part.state.layout
             at = start + np.arange(layout.z.size)
-            at[_shape(layout)] = _shape(first)
+            at[layout.shape] = first.shape
             found.append(at)
         return found
 
@@ -123,11 +123,6 @@ class RigTerms:
         return replace(self, parts=tuple(replace(part, trust=trust) for part in self.parts))
 
 
-def _shape(layout: Layout) -> Indices:
-    """Places in z of the plate's bow, width and height."""
-    return np.concatenate([layout.z.of(["bow"]), layout.plate])
-
-
 def assemble_rig(terms: RigTerms, levels: Sequence[Levels], priors: Sequence[Priors]) -> Reduced:
     """Weight all terms, eliminate the captures' own unknowns and add the priors; one of each for a LiDAR."""
     F, G, n = len(terms.base.trust), terms.size, terms.n_own
@@ -139,7 +134,7 @@ def assemble_rig(terms: RigTerms, levels: Sequence[Levels], priors: Sequence[Pri
         log_volume += summed.log_volume
         of_own = known.information.copy()
         if m:
-            shape = _shape(part.state.layout)
+            shape = part.state.layout.shape
             of_own[shape], of_own[:, shape] = 0.0, 0.0
             # Places that the base's shape fills.
             void = terms.starts[m] + shape
