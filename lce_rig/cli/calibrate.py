@@ -334,7 +334,7 @@ def _parts(
     n_shown = _N_REASONS if len(fresh) <= _N_REASONS else _N_REASONS - 1
     advised: set[str] = set()
     if earlier and not is_explained:
-        yield f"  [{colour}]as {show.escape(' and '.join(earlier))}[/]"
+        yield f"  [{colour}]same reason as {show.escape(' and '.join(earlier))}[/]"
     for finding in c.findings if is_explained else fresh[:n_shown]:
         follows = "follows: " if finding.follows else ""
         tint = "none" if finding.severity == "note" else colour

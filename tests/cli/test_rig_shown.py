@@ -43,7 +43,7 @@ def test_a_reason_of_several_pairs_is_printed_once(capsys):
     fields = {"verdict": "fail", "findings": (DIFFERS,)}
     out = shown(capsys, *(pair(*each, **fields) for each in (("left", "front"), ("left", "rear"))))
     assert out.count(DIFFERS.text) == 1 and out.count(DIFFERS.advice) == 1
-    assert "  as left.frames and front" in out.splitlines()
+    assert "  same reason as left.frames and front" in out.splitlines()
 
 
 def test_a_sensor_without_a_usable_pose_is_named(capsys):
