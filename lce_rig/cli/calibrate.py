@@ -19,7 +19,7 @@ from lce_rig.cli.options import (
     split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
-from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics
+from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, RigPoses
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import sizes
@@ -30,7 +30,7 @@ from lce_rig.pipeline.findings import FEW_DETECTED
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
-from lce_rig.show.tables import result_tables
+from lce_rig.show.tables import result_tables, rig_table
 
 _AXES = ("x right", "y down", "z forward")
 _AXES_OF_LIDAR = ("x forward", "y left", "z up")
@@ -52,7 +52,7 @@ def residual_words(metrics: Metrics, c: Calibration) -> str:
     return f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm{corners}"
 
 
-def _uncertainty(c: Calibration) -> Iterator[str]:
+def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     """State the standard deviations, by axis if the result passes, and for a point at a distance."""
     yield f"  uncertainty  {sizes(c.sigma_rotation_deg, c.sigma_translation_m)} (1 sigma)"
     if c.verdict == "fail":
@@ -60,7 +60,7 @@ def _uncertainty(c: Calibration) -> Iterator[str]:
     names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
     along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
     by_axis = (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm"))
-    for title, values, digits, unit in by_axis if c.verdict == "pass" else ():
+    for title, values, digits, unit in by_axis if is_by_axis and c.verdict == "pass" else ():
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
     for point in c.uncertainty:
@@ -187,8 +187,7 @@ def calibrate(
     if as_json:
         show.print_json(result.document())
     else:
-        for c in result.pairs:
-            show.print_parts(_parts(c, str(result.session.path), is_explained=explain))
+        show_result(result.pairs, result.on_base, opened.rig, str(result.session.path), is_explained=explain)
     show.warn_of(finding for finding in written.findings if finding.severity != "note")
     if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
         show.warn(f"this result is not exported; the last usable result is in {written.previous}")
@@ -277,17 +276,66 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
-    """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested."""
+def show_result(
+    pairs: Sequence[Calibration], poses: RigPoses | None, rig: lce.Rig, path: str, *, is_explained: bool
+) -> None:
+    """Print the pairs of a result, and the poses of three and more sensors.
+
+    Args:
+        pairs: the result.
+        poses: of its sensors; None for two.
+        rig: the profile.
+        path: of the session.
+        is_explained: whether to print everything that was estimated and tested.
+    """
+    told: dict[str, str] = {}
+    for c in pairs:
+        show.print_parts(_parts(c, path, told, is_explained=is_explained, is_of_rig=poses is not None))
+    if poses is not None:
+        show.print_parts(_rig_parts(poses, rig.cameras, pairs))
+
+
+def _rig_parts(
+    poses: RigPoses, cameras: Collection[str], calibrations: Sequence[Calibration]
+) -> Iterator[Any]:
+    """State the pose of each sensor on the base, and which sensors have none."""
+    table = rig_table(poses, cameras)
+    yield f"[bold]rig on {show.escape(poses.base)}[/] (cameras: x forward, y left, z up)"
+    if table.rows:
+        yield show.text_table(table)
+    placed = {poses.base, *(each.sensor for each in poses.sensors)}
+    names = dict.fromkeys(name for c in calibrations for name in (c.camera, c.lidar))
+    for name in names:
+        if name not in placed:
+            yield f"{show.escape(name)}  [{show.COLOURS['fail']}]FAIL[/], no usable pose"
+
+
+def _parts(
+    c: Calibration, path: str, told: dict[str, str], *, is_explained: bool, is_of_rig: bool
+) -> Iterator[Any]:
+    """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested.
+
+    Args:
+        c: the result of a pair.
+        path: of the session.
+        told: reasons of earlier pairs, and the pair; those of this one are added.
+        is_explained: whether to tell everything.
+        is_of_rig: whether a list of all sensors follows, which has the poses.
+    """
     colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"
-    causes = causes_of(c.findings)
+    causes, pair = causes_of(c.findings), str(Pair.of(c))
+    earlier = list(dict.fromkeys(told[each.text] for each in causes if each.text in told))
+    fresh = [each for each in causes if each.text not in told]
+    told |= {each.text: pair for each in fresh}
     used = f"{len(c.captures_used)} of {c.n_captures} captures used"
-    yield f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
+    yield f"[bold]{pair}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
     # A line counts those that are not shown.
-    n_shown = _N_REASONS if len(causes) <= _N_REASONS else _N_REASONS - 1
+    n_shown = _N_REASONS if len(fresh) <= _N_REASONS else _N_REASONS - 1
     advised: set[str] = set()
-    for finding in c.findings if is_explained else causes[:n_shown]:
+    if earlier and not is_explained:
+        yield f"  [{colour}]same reason as {show.escape(' and '.join(earlier))}[/]"
+    for finding in c.findings if is_explained else fresh[:n_shown]:
         follows = "follows: " if finding.follows else ""
         tint = "none" if finding.severity == "note" else colour
         yield f"  [{tint}]{follows}{show.escape(finding.text)}[/]"
@@ -296,19 +344,19 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
             yield f"    -> {show.escape(advice)}"
             advised.add(advice)
     following = [finding for finding in c.findings if finding.follows]
-    if following and not is_explained:
+    if following and not is_explained and (fresh or not earlier):
         more = f"; {len(following) - 1} more" if len(following) > 1 else ""
         yield f"    follows: {show.escape(following[0].text)}{more}"
     if plan and not lacks_captures(causes[:1]):
         yield f"  -> {plan}"
-    if len(causes) > n_shown and not is_explained:
-        more = show.counted(len(causes) - n_shown, "more reason")
+    if len(fresh) > n_shown and not is_explained:
+        more = show.counted(len(fresh) - n_shown, "more reason")
         yield f"  {more} in report.html and by lce-rig calibrate {path} --explain"
-    if is_explained or not has_failed:
+    if is_explained or not (has_failed or is_of_rig):
         target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
         yield show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
         yield from show.matrix_lines(c.T_cam_lidar, "    ")
-    yield from _uncertainty(c)
+    yield from _uncertainty(c, is_by_axis=is_explained or not is_of_rig)
     # Lens and squares that the result has corrected go with its extrinsics.
     corrected = [each for each in c.findings if each.code in _CORRECTED and each.severity == "note"]
     if corrected and c.verdict == "pass" and not is_explained:

@@ -98,6 +98,8 @@ Method = Literal["ml", "paper"]
 DEFAULT_METHOD: Method = "ml"
 """How extrinsics are estimated: the joint maximum likelihood, or Algorithm 1 of LCE-Calib."""
 
+Verdict = Literal["pass", "marginal", "fail"]
+
 
 @dataclass(frozen=True)
 class Certificate:
@@ -411,7 +413,7 @@ class Calibration:
     certificate: Certificate
     egt_rotation_deg: Size | None = None
     egt_translation_m: Size | None = None
-    verdict: Literal["pass", "marginal", "fail"]
+    verdict: Verdict
     findings: tuple[StoredFinding, ...] = ()
     diagnostics: Annotated[Diagnostics, _WITHOUT_NULL, PlainSerializer(Diagnostics.figures)] = field(
         default_factory=Diagnostics
@@ -528,6 +530,37 @@ class Provenance:
 
 
 @dataclass(frozen=True, eq=False)
+class SensorPose:
+    """The pose of a sensor on the rig's base sensor.
+
+    Attributes:
+        sensor: its name.
+        T_base_sensor: (4, 4) p_base = R p_sensor + t; of a camera, of its optical frame.
+        sigma_rotation_deg, sigma_translation_m: roots of the summed variances.
+        verdict: the worst of the pairs that the pose is composed of; never "fail".
+    """
+
+    sensor: str
+    T_base_sensor: Pose
+    sigma_rotation_deg: Size
+    sigma_translation_m: Size
+    verdict: Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class RigPoses:
+    """The poses of the sensors of a rig on one of them.
+
+    Attributes:
+        base: the sensor: the first LiDAR of the profile that has a result.
+        sensors: the others that results which have not failed connect with it.
+    """
+
+    base: str
+    sensors: tuple[SensorPose, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class ResultFile:
     """result.json.
 
@@ -536,6 +569,7 @@ class ResultFile:
         made_by: the program and its version.
         provenance: robot, sensors and date; empty in files of earlier versions.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
+        on_base: the pose of each sensor; None for two sensors, and in files of earlier versions.
         pairs: one for each camera and LiDAR.
     """
 
@@ -545,6 +579,7 @@ class ResultFile:
     made_by: str = MADE_BY
     provenance: Provenance = field(default_factory=Provenance)
     inputs_sha256: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = field(default_factory=dict)
+    on_base: RigPoses | None = None
     pairs: tuple[Annotated[Calibration, BeforeValidator(_from_pair), WrapSerializer(_as_pair)], ...]
 
     def document(self) -> dict[str, Any]:
@@ -567,6 +602,8 @@ class ResultFile:
             del document["provenance"]
         else:
             document["provenance"]["serials"] = dict(sorted(document["provenance"]["serials"].items()))
+        if self.on_base is None:
+            del document["on_base"]
         return document
 
     def text(self) -> str:

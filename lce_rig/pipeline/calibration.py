@@ -373,7 +373,10 @@ def _solve_together(
     """
     excluded = {pair for loop, _ in loops for pair in loop.pairs}
     excluded |= {
-        (alone[k].camera, alone[k].lidar) for members, _, found, _ in links if found for k in members
+        (alone[k].camera, alone[k].lidar)
+        for link in links
+        if link.contradictions
+        for k in _suspects(alone, link)
     }
     cameras = {
         (own.camera, own.lidar): own
@@ -401,6 +404,12 @@ def _solve_together(
             if two.names in pairs:
                 solved_lidars[k] = with_estimate(rig, two, together.estimates[two.names])
     return solved, solved_lidars
+
+
+def _suspects(solved: Sequence[_Solved], link: _Link) -> tuple[int, ...]:
+    """Choose the cameras that a contradiction of two concerns: one whose own captures contradict, or both."""
+    unsound = tuple(k for k in link.members if not _is_sound(solved[k].validation))
+    return unsound or link.members
 
 
 def _is_sound(validation: Validation) -> bool:
@@ -432,7 +441,7 @@ def _judged(
     own, estimate, validation = solved[k], solved[k].estimate, solved[k].validation
     mine = [link for link in links if k in link.members]
     others = [*estimate.association, *(finding for link in mine for finding in link.exchanged)]
-    others += [finding for link in mine for finding in link.contradictions]
+    others += [finding for link in mine if k in _suspects(solved, link) for finding in link.contradictions]
     others += [finding for loop, finding in loops if (own.camera, own.lidar) in loop.pairs]
     # Exchanged LiDARs exchange their cameras' extrinsics, too.
     others += [finding for names, finding in named if own.lidar in names and finding.code == EXCHANGED.code]

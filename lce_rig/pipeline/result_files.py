@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
+from lce_rig.core.calibration import Calibration, Provenance, ResultFile, RigPoses, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
+from lce_rig.core.rig_poses import find_rig_poses
 from lce_rig.export import export, is_export
 from lce_rig.session import Session
 from lce_rig.session.capture import MANIFEST, SAFE_NAME
@@ -70,6 +71,11 @@ class Result:
         raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
 
     @property
+    def on_base(self) -> RigPoses | None:
+        """The pose of each sensor on the first LiDAR; None for two sensors."""
+        return find_rig_poses(self.pairs, self.session.rig.lidars)
+
+    @property
     def provenance(self) -> Provenance:
         """Robot, sensors and date; raises as `provenance_of`."""
         return provenance_of(self.session)
@@ -84,6 +90,7 @@ class Result:
             rig=self.session.rig.name,
             provenance=self.provenance,
             inputs_sha256=inputs_sha256(self.session, self.pairs),
+            on_base=self.on_base,
             pairs=self.pairs,
         )
 

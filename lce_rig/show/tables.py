@@ -1,12 +1,12 @@
 """A result as tables: the report sets them as HTML, the terminal as text."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.core.calibration import AxisDrift, Calibration, SceneOpinion
+from lce_rig.core.calibration import AxisDrift, Calibration, RigPoses, SceneOpinion
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import sizes
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
@@ -69,6 +69,19 @@ def result_tables(c: Calibration) -> dict[str, Table]:
         "scene": axis_table("Scene", scene),
         "cameras": Table("Other cameras that saw the same boards", cameras, _camera_rows(c)),
     }
+
+
+def rig_table(poses: RigPoses, cameras: Collection[str]) -> Table:
+    """List the pose of each sensor on the base; of the cameras, that of their body frames (x forward)."""
+    rows = []
+    for each in poses.sensors:
+        T = each.T_base_sensor @ invert(T_BODY_OPTICAL) if each.sensor in cameras else each.T_base_sensor
+        position = [f"{value:+.4f}" for value in T[:3, 3]]
+        angles = [f"{value:+.3f}" for value in np.degrees(rpy(T[:3, :3]))]
+        sigmas = f"{each.sigma_rotation_deg:.3f}", f"{1000 * each.sigma_translation_m:.1f}"
+        rows.append((each.sensor, each.verdict.upper(), *position, *angles, *sigmas))
+    headings = ("", "", "x m", "y m", "z m", "roll deg", "pitch", "yaw", "sigma deg", "mm")
+    return Table(f"Rig on {poses.base}", headings, rows, 2)
 
 
 def _pose_rows(c: Calibration) -> list[Row]:

@@ -30,7 +30,7 @@ from lce_rig.show.overlays.canvas import accumulated
 from lce_rig.show.page import render, style
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
-from lce_rig.show.tables import result_tables, scene_words
+from lce_rig.show.tables import result_tables, rig_table, scene_words
 
 _LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
 # The statement names the expected error at this distance.
@@ -74,7 +74,8 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
             pair["rejecting"] = f"lce-rig calibrate {shlex.quote(folder)} --without {worst['name']}"
         pairs.append(pair)
     facts = [(name, value) for name, value in facts if value]
-    return render("calibration.html", rig=session.rig.name, pairs=pairs, facts=facts)
+    on_base = None if file.on_base is None else rig_table(file.on_base, session.rig.cameras)
+    return render("calibration.html", rig=session.rig.name, pairs=pairs, facts=facts, on_base=on_base)
 
 
 def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) -> list[str]:
