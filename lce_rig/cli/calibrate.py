@@ -108,7 +108,8 @@ def _uncertainty(c: Calibration) -> Iterator[str]:
     "profile",
     metavar="FILE",
     help="Give the session this profile of the same rig first, as `intrinsics --save-profile` writes "
-    "one; the earlier one stays beside it as rig-1.yaml.",
+    "one; the earlier one stays beside it as rig-1.yaml. With --name, only that result gets it, in its "
+    "folder, and the session keeps its own.",
 )
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
@@ -139,11 +140,13 @@ def calibrate(
     with 6 if a camera has no result.
     """
     result_folder(Path(), name, is_new=True)
-    if profile is not None:
+    if profile is not None and name is None:
         _take_profile(session, profile)
     if without:
         put_aside(session, without, "calibrate --without")
     opened = lce.Session.open(session)
+    if profile is not None and name is not None:
+        opened = opened.with_profile(lce.load_rig(profile))
     rig = opened.rig = opened.rig.of_robot(robot)
     serials_of(opened)
     require_sensors("camera", cameras, rig.cameras)
