@@ -168,7 +168,7 @@ def collect(
     )
     sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
-    with show.progress_bar("collecting") as progress, Session.resume(session, rig) as writer:
+    with show.progress_bar("collecting", has_lines=True) as progress, Session.resume(session, rig) as writer:
         report = collect_into(writer, recordings, n_wanted, progress)
     _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
