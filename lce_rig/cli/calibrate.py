@@ -26,7 +26,7 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
-from lce_rig.pipeline.findings import FEW_DETECTED
+from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -163,6 +163,8 @@ def calibrate(
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, progress=progress)
+    for absent in absent_channels(rig, detections, channels):
+        show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
     with show.progress_bar("calibrating") as progress:
         try:
             result = lce.calibrate(
