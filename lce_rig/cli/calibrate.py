@@ -26,6 +26,7 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
+from lce_rig.pipeline.detect_session import unlike_models
 from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
@@ -163,6 +164,7 @@ def calibrate(
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, progress=progress)
+    show.warn_of(unlike_models(opened, detections))
     for absent in absent_channels(rig, detections, channels):
         show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
     with show.progress_bar("calibrating") as progress:

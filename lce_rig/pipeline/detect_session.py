@@ -100,6 +100,26 @@ def detect(
     return detections
 
 
+def unlike_models(session: Session, detections: Detections) -> list[Finding]:
+    """Compare the first scan of each LiDAR with the beams of its model, as `collect` does.
+
+    Boards are also found in scans with skipped points, at wrong places. Refusals that name these suffice.
+
+    Args:
+        session: open for reading is enough.
+        detections: of the session.
+    """
+    found: list[Finding] = []
+    for lidar, by_capture in detections.lidars.items():
+        codes = {each.code for each in by_capture.values() if isinstance(each, Refusal)}
+        if LIDAR_RINGS_SKIPPED.code in codes or not by_capture:
+            continue
+        with suppress(SessionError):  # The detection names a damaged one.
+            scan = session.capture(min(by_capture)).scan(lidar)
+            found += compare_beams(scan, session.rig.lidars[lidar])
+    return found
+
+
 def event_picture(session: Session, capture: Capture, camera: str, channel: str) -> Image | Refusal:
     """Return the image reconstructed from a capture's raw events, or the cause if there is none.
 

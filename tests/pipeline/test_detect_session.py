@@ -4,7 +4,8 @@ import numpy as np
 
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.detect_session import detect, unlike_models
 from lce_rig.session import Session
 
 
@@ -37,3 +38,12 @@ def test_detect_skipped_points_are_named(rig, tmp_path):
 
 def test_detect_whole_scan_names_no_skipped_points(rig, tmp_path):
     assert refusal_of_room(rig, tmp_path / "s", every=1).code != "lidar.rings_skipped"
+
+
+def test_unlike_models_found_boards_do_not_hide_skipped_points(rig, tmp_path):
+    with Session.create(tmp_path / "s", rig) as session:
+        name = session.add_capture([], [room(rig, every=4)], {})
+        # As if the board had been found in it.
+        (finding,) = unlike_models(session, Detections({}, {"lidar": {name: []}}))
+        assert finding.code == "recording.rings_skipped" and finding.figures["n_seen"] <= 8
+        assert unlike_models(session, detect(session)) == []
