@@ -6,6 +6,7 @@
     scripts/fuzz.py deploy-kills --n 200        `deploy`, killed, into a folder and over ssh
     scripts/fuzz.py interrupts --n 100          Ctrl-C at any moment of any verb
     scripts/fuzz.py inputs                      hostile files, links and pipes as inputs
+    scripts/fuzz.py mutations --n 1000          files with random damage as inputs
 
 Exits with 1 if anything was lost. CONTRIBUTING.md describes the checks.
 """
@@ -25,6 +26,7 @@ TARGETS = {
     "deploy-kills": ("fuzzing.deploy_kills:fuzz_deploy_kills", 200, "deployments, killed"),
     "interrupts": ("fuzzing.interrupts:fuzz_interrupts", 100, "Ctrl-C at any moment"),
     "inputs": ("fuzzing.inputs:fuzz_inputs", 100, "hostile files, links and pipes as inputs"),
+    "mutations": ("fuzzing.mutations:fuzz_mutations", 1000, "files with random damage as inputs"),
 }
 """By name: a function of (n, seed) whose report has `n_wrong`; the default n; help."""
 
@@ -37,7 +39,7 @@ def main() -> None:
     targets = parser.add_subparsers(dest="target", required=True, metavar="TARGET")
     for name, (_, n, text) in TARGETS.items():
         target = targets.add_parser(name, help=text)
-        target.add_argument("--n", type=int, default=n, help=f"kills (default {n})")
+        target.add_argument("--n", type=int, default=n, help=f"kills or inputs (default {n})")
         target.add_argument("--seed", type=int, default=0, help="of the moments (default 0)")
     arguments = parser.parse_args()
     module, function = TARGETS[arguments.target][0].split(":")

@@ -26,7 +26,8 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
-from lce_rig.pipeline.findings import FEW_DETECTED
+from lce_rig.pipeline.detect_session import unlike_models
+from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -108,7 +109,8 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     "profile",
     metavar="FILE",
     help="Give the session this profile of the same rig first, as `intrinsics --save-profile` writes "
-    "one; the earlier one stays beside it as rig-1.yaml.",
+    "one; the earlier one stays beside it as rig-1.yaml. With --name, only that result gets it, in its "
+    "folder, and the session keeps its own.",
 )
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
@@ -139,11 +141,13 @@ def calibrate(
     with 6 if a camera has no result.
     """
     result_folder(Path(), name, is_new=True)
-    if profile is not None:
+    if profile is not None and name is None:
         _take_profile(session, profile)
     if without:
         put_aside(session, without, "calibrate --without")
     opened = lce.Session.open(session)
+    if profile is not None and name is not None:
+        opened = opened.with_profile(lce.load_rig(profile))
     rig = opened.rig = opened.rig.of_robot(robot)
     serials_of(opened)
     require_sensors("camera", cameras, rig.cameras)
@@ -160,6 +164,9 @@ def calibrate(
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, progress=progress)
+    show.warn_of(unlike_models(opened, detections))
+    for absent in absent_channels(rig, detections, channels):
+        show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
     with show.progress_bar("calibrating") as progress:
         try:
             result = lce.calibrate(

@@ -168,7 +168,7 @@ def collect(
     )
     sources = [SourceOptions(*names, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
-    with show.progress_bar("collecting") as progress, Session.resume(session, rig) as writer:
+    with show.progress_bar("collecting", has_lines=True) as progress, Session.resume(session, rig) as writer:
         report = collect_into(writer, recordings, n_wanted, progress)
     _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
@@ -176,7 +176,8 @@ def collect(
         show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:
-        hold_s = ceil(stillness_window_s(rig))
+        window_s = stillness_window_s(rig)
+        hold_s = ceil(window_s)
         hint = (
             f"Hold the board still for {hold_s} s in view of both sensors, and check that their clocks agree."
         )
@@ -192,7 +193,13 @@ def collect(
             )
         elif report.has_events:
             hint = "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
-        raise NotEnoughDataError(f"{session}: no capture from {', '.join(map(str, paths))}", hint)
+        what = f"{session}: no capture from {', '.join(map(str, paths))}"
+        if 0 < report.longest_s < window_s:
+            what += f", which lasts {report.longest_s:.1f} s (minimum {window_s:.1f} s)"
+            hint = (
+                f"Record each placement with the board standing still in view of both sensors for {hold_s} s."
+            )
+        raise NotEnoughDataError(what, hint)
     show_next(session, rig, predict(Session.open(session)), n_captures)
 
 

@@ -16,7 +16,7 @@ from lce_rig.fleet import deployment
 from lce_rig.fleet.deployment import Deployed, Plan
 from lce_rig.fleet.releases import ReleaseRecord, TargetState, differences_in_words, find_target
 from lce_rig.fleet.target import TargetSettings
-from lce_rig.pipeline.result_files import result_folder
+from lce_rig.pipeline.result_files import result_folder, with_profile_of
 
 
 @click.command()
@@ -85,7 +85,7 @@ def deploy(
         else:
             _show_done(deployment.rollback(target, release, reason=reason), target, again, as_json=as_json)
         return
-    opened = lce.Session.open(session)
+    opened = with_profile_of(lce.Session.open(session), name)
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)

@@ -12,7 +12,7 @@ from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.export import EXPORTS, USUAL, load_exporter, require_usable
 from lce_rig.export.urdf import read_robot, write_into_urdf
-from lce_rig.pipeline.result_files import RESULT, result_folder
+from lce_rig.pipeline.result_files import RESULT, result_folder, with_profile_of
 
 
 def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
@@ -89,7 +89,7 @@ def export(
         )
     if into is not None and (formats or tree) is not None:
         raise UsageError("--formats and --tree apply to --output only", "Omit them, or omit --into.")
-    opened = lce.Session.open(session)
+    opened = with_profile_of(lce.Session.open(session), name)
     pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
     if output is not None:
         robot = None if tree is None else read_robot(tree)

@@ -5,7 +5,8 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ import click
 import yaml
 
 from lce_rig.core.findings import Finding
+from lce_rig.core.progress import Progress
 
 if TYPE_CHECKING:
     from lce_rig.show.tables import Table
@@ -23,6 +25,8 @@ COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 _MOST_UNBROKEN, _WIDTH = 24, 80
 # Lines that go on stand below the text after "-> ".
 _HANG = 3
+# Shortest and longest time between two lines of progress, s.
+_SHORTEST_S, _LONGEST_S = 2.0, 30.0
 
 
 def note(text: str) -> None:
@@ -180,15 +184,39 @@ class ProgressBar:
         self._task = self._bar.add_task(f"{self._title}: {step}", total=None)
 
 
+class ProgressLines:
+    """Lines of progress for a file or a pipe: at every 10 %, and at least every 30 s; none of short work."""
+
+    def __init__(self, title: str, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._title, self._now_s = title, now_s
+        self._last_s, self._tenths = now_s(), 0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Print how many are done, if it is time."""
+        passed_s, tenths = self._now_s() - self._last_s, 10 * done // max(total, 1)
+        is_step = tenths > self._tenths and passed_s >= _SHORTEST_S
+        if done < total and (is_step or passed_s >= _LONGEST_S):
+            self._last_s, self._tenths = self._now_s(), tenths
+            note(f"{self._title}: {done} of {total} ({100 * done // total} %)")
+
+
 @contextmanager
-def progress_bar(title: str) -> Iterator[ProgressBar]:
-    """Show a progress bar of this title on stderr; nothing if stderr is not a terminal."""
+def progress_bar(title: str, *, has_lines: bool = False) -> Iterator[Progress]:
+    """Show a progress bar of this title on stderr.
+
+    Args:
+        title: of the work.
+        has_lines: prints lines if stderr is not a terminal; by default, it gets nothing then.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
     console = Console(stderr=True)
+    if has_lines and not console.is_terminal:
+        yield ProgressLines(title)
+        return
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield ProgressBar(bar, title)
 

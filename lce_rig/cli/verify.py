@@ -15,7 +15,7 @@ from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
 from lce_rig.judge.findings import causes_of
 from lce_rig.judge.session_check import SessionCheck
-from lce_rig.pipeline.result_files import RESULT, result_folder
+from lce_rig.pipeline.result_files import RESULT, result_folder, with_profile_of
 from lce_rig.pipeline.verification import profile_behind
 from lce_rig.show.overlays.view_3d import CameraIn3D, CaptureIn3D, draw_picture, show_window
 from lce_rig.show.tables import scene_words
@@ -117,7 +117,7 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
 
     Exits with 5 where there is no display, or Open3D cannot open a window.
     """
-    opened = lce.Session.open(session)
+    opened = with_profile_of(lce.Session.open(session), name)
     pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
     pairs = tuple(c for c in pairs if not c.is_of_lidars)
     if not pairs:

@@ -54,6 +54,7 @@ class CollectReport:
         errors: recordings that could not be read to their end; what was captured before is kept.
         n_missing: captures short of the target.
         has_events: whether any recording held events, which make the board's motion wanted.
+        longest_s: between the first and the last scan of the longest continuous recording; 0 without any.
     """
 
     captured: list[str] = field(default_factory=list)
@@ -64,6 +65,7 @@ class CollectReport:
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
     has_events: bool = False
+    longest_s: float = 0.0
 
     def note(self, notes: Iterable[str]) -> None:
         """Keep notes, each once."""
@@ -304,9 +306,13 @@ class _Collector:
     def _read(self, recording: ContinuousRecording) -> Iterator[Sample]:
         """Yield samples up to a tear, whose error is kept: moments before it are still captured."""
         done, self._torn = 0, None
+        first_ns: int | None = None
         try:
             known = set[str]()
             for sample in check_overlap(recording.samples(), self._session.rig, recording.notes):
+                if isinstance(sample, Scan) and sample.stamp_ns is not None:
+                    first_ns = sample.stamp_ns if first_ns is None else first_ns
+                    self.report.longest_s = max(self.report.longest_s, (sample.stamp_ns - first_ns) / 1e9)
                 if isinstance(sample, Scan) and sample.sensor not in known:
                     _require_own_frame(sample, str(recording.path))
                     known.add(sample.sensor)

@@ -29,11 +29,10 @@ BEAMS_OF_OTHER_MODEL = warning_kind(
     "name the LiDAR's model in lidars.{subject}.model",
     actions={"named": "set lidars.{subject}.model to {names}"},
 )
-RINGS_SKIPPED = warning_kind(
-    "recording.rings_skipped",
-    "{subject}: {n_seen} of {n_rings} rings in each direction: points are skipped",
-    "record every point (point_filter_num: 1), or correct lidars.{subject}.model",
-)
+_SKIPPED = "{n_seen} of {n_rings} rings in each direction: points are skipped"
+_EVERY_POINT = "record every point (point_filter_num: 1), or correct lidars.{subject}.model"
+RINGS_SKIPPED = warning_kind("recording.rings_skipped", "{subject}: " + _SKIPPED, _EVERY_POINT)
+LIDAR_RINGS_SKIPPED = Kind("lidar.rings_skipped", _SKIPPED, _EVERY_POINT)
 
 
 DAMAGED = warning_kind("packet.damaged", "{n} damaged packets skipped (first: {where})")

@@ -24,6 +24,8 @@ from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
 from lce_rig.detect.events.search import find_event_board
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.findings import LIDAR_OTHER_ORIGIN
+from lce_rig.io.beams import compare_beams
+from lce_rig.io.findings import LIDAR_RINGS_SKIPPED, RINGS_SKIPPED
 from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
@@ -98,6 +100,26 @@ def detect(
     return detections
 
 
+def unlike_models(session: Session, detections: Detections) -> list[Finding]:
+    """Compare the first scan of each LiDAR with the beams of its model, as `collect` does.
+
+    Boards are also found in scans with skipped points, at wrong places. Refusals that name these suffice.
+
+    Args:
+        session: open for reading is enough.
+        detections: of the session.
+    """
+    found: list[Finding] = []
+    for lidar, by_capture in detections.lidars.items():
+        codes = {each.code for each in by_capture.values() if isinstance(each, Refusal)}
+        if LIDAR_RINGS_SKIPPED.code in codes or not by_capture:
+            continue
+        with suppress(SessionError):  # The detection names a damaged one.
+            scan = session.capture(min(by_capture)).scan(lidar)
+            found += compare_beams(scan, session.rig.lidars[lidar])
+    return found
+
+
 def event_picture(session: Session, capture: Capture, camera: str, channel: str) -> Image | Refusal:
     """Return the image reconstructed from a capture's raw events, or the cause if there is none.
 
@@ -161,7 +183,18 @@ class _Finder:
 
     def scan(self, capture: Capture, lidar: str) -> LidarDetection:
         """Find the surfaces of the board's size in a scan."""
-        return self._remembered(self._digest, capture, lidar, lambda: self._boards.scan(capture.scan(lidar)))
+
+        def find() -> LidarDetection:
+            scan = capture.scan(lidar)
+            found = self._boards.scan(scan)
+            if not isinstance(found, Refusal) or found.stage != "lidar":
+                return found
+            # Skipped points hide the board wherever it is held.
+            seen = compare_beams(scan, self._session.rig.lidars[lidar])
+            skipped = next((each for each in seen if each.code == RINGS_SKIPPED.code), None)
+            return found if skipped is None else LIDAR_RINGS_SKIPPED.refusal(lidar, **skipped.figures)
+
+        return self._remembered(self._digest, capture, lidar, find)
 
     def look(self, capture: Capture, lidar: str, poses: Sequence[Array]) -> LidarDetection:
         """Find the board in a scan about one of the predicted poses T_lidar_board (4, 4)."""

@@ -1,9 +1,11 @@
 """Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
-from lce_rig.core.findings import Finding, Kind, Losses, Refusal
+from lce_rig.core.findings import Finding, Kind, Losses, Refusal, warning_kind
 from lce_rig.core.phrasing import captures_to_add
+from lce_rig.detect.detection import Detections
+from lce_rig.rig import Rig
 
 
 def _commonest(finding: Finding) -> str:
@@ -40,6 +42,33 @@ def few_detected(subject: str, n_detected: int, refused: Mapping[str, Refusal], 
         n_needed=n_needed,
         causes=tuple((n, why.code, f"{why.family}: {why.sentence}") for why, n in losses.counts()[:3]),
     )
+
+
+CHANNEL_ABSENT = warning_kind(
+    "shortage.channel_absent",
+    "no capture holds {subject}: the result is without it",
+    "collect it, or omit it: `lce-rig calibrate {session} --channels {held}`",
+)
+
+
+def absent_channels(rig: Rig, detections: Detections, wanted: Collection[str] | None) -> list[Finding]:
+    """List the channels without a capture, of cameras that have captures by another channel.
+
+    Args:
+        rig: with the channels.
+        detections: of the session.
+        wanted: names of the channels that are used; None for all.
+    """
+    cameras = {camera for camera, _ in detections.images}
+    held = ",".join(sorted({channel for _, channel in detections.images}))
+    return [
+        CHANNEL_ABSENT(f"{camera}.{channel}", held=held)
+        for camera, settings in rig.cameras.items()
+        for channel in settings.channels
+        if camera in cameras
+        and (wanted is None or channel in wanted)
+        and (camera, channel) not in detections.images
+    ]
 
 
 SHORTAGE = Kind("shortage.text", "{text}", "{advice}", severity="warning")

@@ -12,6 +12,7 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, U
 from lce_rig.core.findings import Finding
 from lce_rig.core.rig_poses import find_rig_poses
 from lce_rig.export import export, is_export
+from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.session.capture import MANIFEST, SAFE_NAME
 from lce_rig.session.durable import check_folder, copy_over, replacing, write_atomically
@@ -89,7 +90,7 @@ class Result:
         return ResultFile(
             rig=self.session.rig.name,
             provenance=self.provenance,
-            inputs_sha256=inputs_sha256(self.session, self.pairs),
+            inputs_sha256=inputs_sha256(self.session, self.pairs, self.session.profile_content()),
             on_base=self.on_base,
             pairs=self.pairs,
         )
@@ -107,22 +108,27 @@ class Result:
         overlays and calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
         Args:
-            name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
+            name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched. The
+                profile of `Session.with_profile` is written there, too.
             force: export failed results too; each file then says so.
             report: write report.html, too, as `write_report` does; that of another result does not stay.
 
         Raises:
-            UsageError: the name is not valid.
+            UsageError: the name is not valid, or missing where the profile is not the session's own.
             SessionError: a capture that was used is missing, or the disk is full; the earlier files are
                 unchanged.
             ResultRefusedError: a pose or covariance is not finite; the same.
         """
-        place = result_folder(self.session.path, name, is_new=True)
+        place, profile = result_folder(self.session.path, name, is_new=True), self.session.other_profile
+        if name is None and profile is not None:
+            raise UsageError("a result with another profile than the session's needs a name", "Name it.")
         usable = [c for c in self.pairs if force or c.verdict != "fail"]
         findings: list[Finding] = []
         files = [place / RESULT]
         with replacing(self.session.path, place, _keep_earlier) as draft:
             write_atomically(draft / RESULT, self.file().text())
+            if profile is not None:
+                write_atomically(draft / PROFILE, profile)
             if usable:
                 exported = export(
                     usable, self.session.rig, draft, is_forced=force, session=self.session, findings=findings
@@ -187,18 +193,44 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
     return session / RESULTS / name
 
 
-def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
+def with_profile_of(session: Session, name: str | None) -> Session:
+    """Return a session with the profile of one of its results: the one stored beside it, if there is one.
+
+    Args:
+        session: open for reading is enough.
+        name: of the result; None for the one in calibration/, whose profile is the session's.
+
+    Raises:
+        UsageError, ProfileError, SessionError: the name, or the profile there, cannot be used.
+    """
+    profile = _own_profile(session, name)
+    return session if profile is None else session.with_profile(load_rig(profile))
+
+
+def _own_profile(session: Session, name: str | None) -> Path | None:
+    """Return the path of the profile stored beside a result; None where it has the session's."""
+    folder = result_folder(session.path, name)
+    is_named = (session.path / RESULTS) in folder.parents
+    return folder / PROFILE if is_named and (folder / PROFILE).is_file() else None
+
+
+def inputs_sha256(session: Session, calibrations: Sequence[Calibration], profile: bytes) -> dict[str, str]:
     """Fingerprint the inputs of results: the profile, and the manifest of every capture used.
 
     A manifest holds the SHA-256 of the capture's files.
 
+    Args:
+        session: of the captures.
+        calibrations: the results.
+        profile: content of rig.yaml beside the result, else in the session.
+
     Returns:
-        SHA-256 by path in the session.
+        SHA-256 by path in the session; that of the profile by "rig.yaml", wherever it is.
 
     Raises:
         SessionError: a capture that was used is missing.
     """
-    digests = {PROFILE: hashlib.sha256((session.path / PROFILE).read_bytes()).hexdigest()}
+    digests = {PROFILE: hashlib.sha256(profile).hexdigest()}
     held = {capture.name: capture for capture in session.captures}
     for name in sorted({name for calibration in calibrations for name in calibration.captures_used}):
         # `Session.capture` raises where one is missing; it lists the folder each time.
@@ -305,8 +337,10 @@ def stored_results(session: Session) -> list[StoredResult]:
                 problem = error.what
             if file is not None:
                 is_outdated = True
+                profile = _own_profile(session, name) or session.path / PROFILE
                 with suppress(LceRigError):
-                    is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs)
+                    digests = inputs_sha256(session, file.pairs, profile.read_bytes())
+                    is_outdated = dict(file.inputs_sha256) != digests
             written_s = (folder / RESULT).stat().st_mtime
             results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
     return results
@@ -323,4 +357,4 @@ def result_content(folder: Path) -> bytes | None:
 
 
 def _is_of_a_result(path: Path) -> bool:
-    return path.name in (RESULT, REPORT, OVERLAYS) or is_export(path)
+    return path.name in (RESULT, REPORT, OVERLAYS, PROFILE) or is_export(path)

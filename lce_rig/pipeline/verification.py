@@ -26,6 +26,7 @@ from lce_rig.pipeline.result_files import (
     result_content,
     result_folder,
     stored_results,
+    with_profile_of,
 )
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig, load_rig
@@ -137,6 +138,9 @@ def verify(
             sensors.
     """
     calibrations, own_result = _extrinsics(session, result, name)
+    own = session if result is not None else with_profile_of(session, name)
+    if own is not session:
+        session, detections = own, None
     rig, notes = with_lenses_of(session.rig, profile)
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
@@ -170,7 +174,8 @@ def profile_behind(path: Path, result: ResultFile) -> Rig | None:
         None where there is no such profile, or where it is not the one that the result names.
     """
     digests = result.inputs_sha256.values()
-    for folder in path.resolve().parents[:3]:
+    # As deep as results/NAME/previous/result.json lies in its session.
+    for folder in path.resolve().parents[:4]:
         # Earlier profiles of a session stay in it as rig-1.yaml, rig-2.yaml, ...
         for profile in (folder / PROFILE, *sorted(folder.glob("rig-*.yaml"))):
             if profile.is_file() and sha256(profile.read_bytes()).hexdigest() in digests:

@@ -67,6 +67,8 @@ class Session:
         self.rig = rig
         self._lock = lock
         self._names_by_content: dict[str, str] | None = None
+        # The text of the profile of `with_profile`; None for the session's own.
+        self._other_profile: str | None = None
 
     @classmethod
     def create(cls, path: Path | str, rig: Rig) -> "Session":
@@ -175,10 +177,7 @@ class Session:
             SessionError: the profile is of another rig, the session is open read-only, or the disk is full.
         """
         self._require_lock()
-        foreign = foreign_keys(self.rig, rig)
-        if foreign:
-            raise _of_another_rig(self, rig, foreign, "Give a profile of the same rig.")
-        adopted = keep_identity(self.rig, rig)
+        adopted = self._same_rig(rig)
         if adopted == self.rig:
             return ""
         n = next(n for n in count(1) if not (self.path / f"rig-{n}.yaml").exists())
@@ -190,6 +189,41 @@ class Session:
         self.rig = adopted
         self.journal("profile", earlier=f"rig-{n}.yaml")
         return f"rig-{n}.yaml"
+
+    def with_profile(self, rig: Rig) -> "Session":
+        """Return the session, open for reading, with another profile of the same rig; files do not change.
+
+        Args:
+            rig: as of `adopt`.
+
+        Raises:
+            SessionError: the profile is of another rig.
+        """
+        other = Session(self.path, self._same_rig(rig), None)
+        if other.rig != self.rig:
+            other._other_profile = dump_rig(other.rig)
+        return other
+
+    @property
+    def other_profile(self) -> str | None:
+        """The text of the profile of `with_profile`; None where it is the session's own."""
+        return self._other_profile
+
+    def profile_content(self) -> bytes:
+        """Read the profile in use, as rig.yaml holds it."""
+        other = self._other_profile
+        return (self.path / PROFILE).read_bytes() if other is None else other.encode()
+
+    def _same_rig(self, rig: Rig) -> Rig:
+        """Give another profile this session's robot and serial numbers.
+
+        Raises:
+            SessionError: it is of another rig.
+        """
+        foreign = foreign_keys(self.rig, rig)
+        if foreign:
+            raise _of_another_rig(self, rig, foreign, "Give a profile of the same rig.")
+        return keep_identity(self.rig, rig)
 
     def keep_text(self, text: str) -> None:
         """Keep a profile's text with its comments, if it says what the session's profile says.

@@ -5,9 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
+from lce_rig.cli.main import run
 from lce_rig.collect.offline import collect
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import NotEnoughDataError, SourceError
 from lce_rig.io import open_recording
+from lce_rig.rig import dump_rig
 from lce_rig.session import Session
 from tests.collect.live.replay import placements
 from tests.shared import changed
@@ -96,3 +98,16 @@ def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, wri
     bridged = changed(alone, cameras__davis__channels__frames__timestamps__expected_offset_s=-3.0)
     with Session.create(tmp_path / "bridged", bridged) as session:
         assert len(collect(session, [open_recording(bag, bridged)]).captured) == 1
+
+
+def test_collect_longest_recording_is_measured(collected):
+    assert collected[1].longest_s == pytest.approx(0.1 * (len(VISIT) - 1), abs=0.2)
+
+
+def test_collect_too_short_recording_names_its_length(tmp_path, write_bag, rig, capsys):
+    write_bag(tmp_path / "short.bag", [0] * 3)
+    (tmp_path / "rig.yaml").write_text(dump_rig(rig))
+    words = ["collect", "--rig", str(tmp_path / "rig.yaml"), str(tmp_path / "s")]
+    assert run([*words, "--from", str(tmp_path / "short.bag")]) == NotEnoughDataError.exit_code
+    err = capsys.readouterr().err
+    assert "which lasts 0.2 s (minimum 0.5 s)" in err and "standing still" in err

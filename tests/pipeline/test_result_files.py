@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 
 from lce_rig.core.calibration import read_result
-from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError
-from lce_rig.pipeline.result_files import Result, result_content
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
+from lce_rig.pipeline.result_files import Result, result_content, stored_results, with_profile_of
+from lce_rig.pipeline.verification import profile_behind
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, reason, some_pose
@@ -185,3 +186,29 @@ def test_an_interrupted_report_leaves_a_complete_result(session, folder):
         result.write_report()
     assert "report.html" not in names(folder)
     assert result.write().report.exists()
+
+
+def test_write_other_profile_stays_beside_its_result(session, folder):
+    write(session, GOOD)
+    own = session.profile_content()
+    rig = changed(session.rig, board__square_m=0.071)
+    Result(session.with_profile(rig), (OTHER,)).write(name="wide", report=False)
+    place = session.path / "results" / "wide"
+    assert (session.path / "rig.yaml").read_bytes() == own and names(session.path).isdisjoint({"rig-1.yaml"})
+    assert load_rig(place / "rig.yaml") == rig
+    assert with_profile_of(session, "wide").rig == rig and with_profile_of(session, None) is session
+    assert profile_behind(place / "result.json", read_result(place / "result.json")) == rig
+    assert not any(result.is_outdated for result in stored_results(session))
+    # The next result of this name has the session's profile; the other one goes with the earlier result.
+    Result(session, (GOOD,)).write(name="wide", report=False)
+    assert not (place / "rig.yaml").exists()
+    earlier = place / "previous" / "result.json"
+    assert profile_behind(earlier, read_result(earlier)) == rig
+    assert not any(result.is_outdated for result in stored_results(session))
+
+
+def test_write_other_profile_without_a_name_is_refused(session):
+    other = session.with_profile(changed(session.rig, board__square_m=0.071))
+    with pytest.raises(UsageError, match="needs a name"):
+        write(other, GOOD)
+    assert not (session.path / "calibration").exists()

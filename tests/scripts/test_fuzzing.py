@@ -4,6 +4,7 @@ import pytest
 from fuzzing.hostile import HOSTILE, N_NEIGHBOURS, add_result
 from fuzzing.inputs import MOST_MB, MOST_S, run_limited
 from fuzzing.interrupts import fuzz_interrupts
+from fuzzing.mutations import TARGETS, fuzz_mutations
 
 from lce_rig.session import Session
 
@@ -38,3 +39,9 @@ def test_hostile_input_is_refused_in_little_memory(tmp_path, whole, name):
     assert outcome.code in range(10) and "Traceback" not in outcome.text, outcome.text
     if (tmp_path / name / "recording").is_dir():
         assert len(Session.open(tmp_path / name / "session").captures) == N_NEIGHBOURS
+
+
+@pytest.mark.long
+def test_fuzz_mutations_damaged_files_are_no_crash():
+    report = fuzz_mutations(2 * len(TARGETS), seed=2)
+    assert [each for each in report.wrong if "took" not in each] == []

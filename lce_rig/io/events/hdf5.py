@@ -25,6 +25,7 @@ _BLOCK_EVENTS = 1 << 20
 _FIELDS = ("t", "x", "y", "p")
 _GROUPS = ("events/", "CD/events/", "")
 _TABLE = "CD/events"
+_MOST_LINKS = 8
 _ECF = 36559
 """Number of Prophesee's HDF5 filter, which Metavision's files are compressed by."""
 
@@ -44,7 +45,8 @@ class Hdf5Events(EventStream):
         with _open(path) as file:
             # Columns of a torn file differ in length.
             self._n_events = min(map(len, _columns(file)))
-            self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
+            offset = _find(file, "t_offset")
+            self._offset_us = 0 if offset is None else int(offset[()])
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
@@ -92,12 +94,53 @@ def _columns(file: Any) -> list[Any]:
     Raises:
         ValueError: there are none.
     """
-    table = file.get(_TABLE)
+    table = _find(file, _TABLE)
     if {*_FIELDS} <= {*(getattr(getattr(table, "dtype", None), "names", None) or ())}:
         _require_filter(table)
         return [table.fields(name) for name in _FIELDS]
-    group = next((group for group in _GROUPS if f"{group}t" in file), _GROUPS[0])
+    group = next((group for group in _GROUPS if _find(file, f"{group}t") is not None), _GROUPS[0])
     return [_column(file, f"{group}{name}") for name in _FIELDS]
+
+
+def _find(group: Any, name: str, most_links: int = _MOST_LINKS) -> Any:
+    """Return the object of a name, None if there is none; links inside the file are followed.
+
+    Args:
+        group: where a relative name begins.
+        name: with slashes.
+        most_links: soft links that may follow each other.
+
+    Raises:
+        SourceError: it is in another file, which is not opened.
+        ValueError: soft links lead in a circle.
+    """
+    import h5py
+
+    here = group.file if name.startswith("/") else group
+    for part in filter(None, name.split("/")):
+        links = getattr(getattr(here, "id", None), "links", None)
+        if part == "." or links is None or not links.exists(part.encode()):
+            here = here if part == "." else None
+            continue
+        kind = links.get_info(part.encode()).type
+        if kind == h5py.h5l.TYPE_HARD:
+            here = here[part]
+        elif kind == h5py.h5l.TYPE_SOFT:
+            if not most_links:
+                raise ValueError(f"the links of {name} lead in a circle")
+            here = _find(here, links.get_val(part.encode()).decode(), most_links - 1)
+        else:
+            raise _of_other_file(group, name)
+    if isinstance(here, h5py.Dataset) and (here.is_virtual or here.external):
+        raise _of_other_file(group, name)
+    return here
+
+
+def _of_other_file(group: Any, name: str) -> SourceError:
+    return SourceError(
+        f"{group.file.filename}: {name} is in another file, which is not opened",
+        "Copy all columns into one file: h5py's `file.copy(name, target, expand_external=True)`.",
+    )
 
 
 def _require_filter(table: Any) -> None:
@@ -119,7 +162,7 @@ def _column(file: Any, name: str) -> Any:
     Raises:
         ValueError: there is none of this name.
     """
-    column = file.get(name)
+    column = _find(file, name)
     if getattr(column, "ndim", 0) != 1 or column.dtype.kind not in "biuf":
         raise ValueError(f"it has no list of numbers {name}")
     return column

@@ -165,6 +165,47 @@ def test_hdf5_compressed_by_a_plugin_is_read(tmp_path):
     assert everything(open_events(tmp_path / "a.h5")) == listed(EVENTS)
 
 
+def link_to_other_file(h5py, path):
+    return h5py.ExternalLink(str(path), "events/x")
+
+
+def column_in_other_file(h5py, path):
+    layout = h5py.VirtualLayout(len(EVENTS), np.uint16)
+    layout[:] = h5py.VirtualSource(str(path), "events/x", (len(EVENTS),))
+    return layout
+
+
+@pytest.mark.parametrize("of_other", [link_to_other_file, column_in_other_file])
+def test_hdf5_columns_of_other_files_are_refused(tmp_path, of_other):
+    h5py = pytest.importorskip("h5py")
+    for name in ("a.h5", "other.h5"):
+        write_dsec(tmp_path / name, EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        made = of_other(h5py, tmp_path / "other.h5")
+        if isinstance(made, h5py.ExternalLink):
+            file["events/x"] = made
+        else:
+            file.create_virtual_dataset("events/x", made)
+    with pytest.raises(SourceError, match=r"a\.h5: events/x is in another file"):
+        everything(open_events(tmp_path / "a.h5"))
+
+
+def test_hdf5_links_inside_the_file_are_followed(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["all/x"] = file["events/x"][:]
+        del file["events/x"]
+        file["events/x"] = h5py.SoftLink("/all/x")
+    assert everything(open_events(tmp_path / "a.h5")) == listed(EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        file["events/x"] = h5py.SoftLink("x")
+    with pytest.raises(SourceError, match="lead in a circle"):
+        everything(open_events(tmp_path / "a.h5"))
+
+
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.bag", "a.raw", "a.mp4"])
 def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path, name):
     for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
