@@ -23,6 +23,10 @@ def test_calibrate_fail_shows_a_reason_that_fails(drawn):
     judged = with_findings(calibration(), found)
     if judged.verdict != "fail":
         return
-    lines = [line for line in _parts(judged, "session", is_explained=False) if isinstance(line, str)]
+    lines = [
+        line
+        for line in _parts(judged, "session", {}, is_explained=False, is_of_rig=False)
+        if isinstance(line, str)
+    ]
     fails = [each.text for each in judged.findings if each.severity == "error"]
     assert any(text in line for text in fails for line in lines)
