@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -20,6 +21,8 @@ MOST_S, MOST_MB = 5.0, 500.0
 # Above what is asked, so that the excess is measured; the computer must live.
 _STOP_S, _STOP_BYTES = 60.0, 3_500_000_000
 _BUG = 70
+# Time between two readings of a process's memory.
+_POLL_S = 0.01
 
 
 @dataclass
@@ -73,10 +76,22 @@ def run_limited(words: list[str]) -> Outcome:
     resource.prlimit(process.pid, resource.RLIMIT_DATA, (_STOP_BYTES, _STOP_BYTES))
     timer = threading.Timer(_STOP_S, os.killpg, (process.pid, signal.SIGKILL))
     timer.start()
-    _, status, usage = os.wait4(process.pid, 0)
+    peak_mb = 0.0
+    while process.poll() is None:
+        peak_mb = max(peak_mb, _peak_mb(process.pid))
+        time.sleep(_POLL_S)
     timer.cancel()
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return Outcome(process.returncode, time.monotonic() - began_s, usage.ru_maxrss / 1024, said(process))
+    return Outcome(process.returncode, time.monotonic() - began_s, peak_mb, said(process))
+
+
+def _peak_mb(pid: int) -> float:
+    """Read the largest resident memory of a running process; its resource usage has its parent's as well."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    except OSError:
+        return 0.0  # it has just ended
+    found = re.search(r"VmHWM:\s+(\d+) kB", status)
+    return int(found[1]) / 1024 if found else 0.0
 
 
 def fuzz_inputs(n: int, seed: int) -> InputReport:

@@ -117,6 +117,7 @@ _VALUES = {
     "--targets": "deploy.yaml",
     "--robot": "kestrel",
     "--rig": "rig.yaml",
+    "--channels": "frames",
     "--from": "recording",
     "--save-profile": "new.yaml",
     "--result": "session/calibration/result.json",
@@ -193,7 +194,8 @@ def workbench():
         wrong.write_text(re.sub(r"(f[xy]_px): [0-9.]+", r"\1: 924.0", rig.read_text()))
         shutil.copytree(session, folder / "refocused")
         calls("calibrate", folder / "refocused", "--rig", wrong)
-        calls("calibrate", session, "--name", "second")
+        calls("calibrate", session, "--name", "second", "--robot", "kestrel", "--without", "000002")
+        calls("captures", session, "--restore", "000002")
         (folder / "deploy.yaml").write_text("targets: {kestrel: {to: robot, robot: kestrel}}\n")
         calls("fleet", "run", folder / "sessions", "--registry", folder / "registry", "--workers", "1")
         for name in ((), ("--name", "second")):
