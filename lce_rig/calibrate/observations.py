@@ -115,7 +115,12 @@ def join_scans(
 
 def scan_key(observation: Observation) -> bytes:
     """Identify the board of a scan by its points."""
-    return observation.lidar.points.tobytes()
+    return board_key(observation.lidar)
+
+
+def board_key(lidar: LidarBoard) -> bytes:
+    """Identify a board in a scan by its points."""
+    return lidar.points.tobytes()
 
 
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:

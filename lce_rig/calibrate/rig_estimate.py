@@ -18,7 +18,7 @@ from lce_rig.calibrate.likelihood.layout import Layout, State
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, spread, stack_scans
 from lce_rig.calibrate.likelihood.rig import RigEstimate, maximise_rig, relate
-from lce_rig.calibrate.observations import group_poses
+from lce_rig.calibrate.observations import board_key, group_poses
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
 from lce_rig.calibrate.session_lens import SessionLens
@@ -95,7 +95,7 @@ def estimate_rig(
     held = {name for pair in (*cameras, *between) for name in pair}
     of_lidars = tuple(name for name in lidars if name in held)
     of_cameras = tuple(sorted(held - set(of_lidars)))
-    lenses = {camera: _lens_of(camera, cameras) for camera in of_cameras}
+    lenses = {camera: _main_estimate(camera, cameras).lens for camera in of_cameras}
     seen = list(_list_seen(cameras, between, lenses))
     conflicts = _conflicts(seen)
     frames = _Frames.of([each for each in seen if each.capture not in conflicts], of_cameras, of_lidars)
@@ -233,7 +233,7 @@ def _report(
     scatter, constants = (J @ each @ J.T for each in joint.covariances)
     if is_of_lidars:
         constants = constants + joint.of_model(J)
-    left_out = jackknife_scatter(joint.cost.moves() @ J.T)
+    left_out = jackknife_scatter(joint.left_out @ J.T)
     n_placements = len(np.unique(joint.placement[np.array(frames, dtype=np.intp)]))
     cov, inflation = widen(scatter + constants, left_out, n_placements)
     part, at = joint.terms.parts[m], joint.terms.places[m]
@@ -248,9 +248,9 @@ def _report(
     return replace(estimate, method="ml", sensitivities=moves)
 
 
-def _lens_of(camera: str, cameras: Mapping[SensorPair, CalibrationEstimate]) -> SessionLens | None:
-    """Choose the lens of the pair with the most captures."""
-    return max((e for (name, _), e in cameras.items() if name == camera), key=lambda e: len(e.used)).lens
+def _main_estimate(camera: str, cameras: Mapping[SensorPair, CalibrationEstimate]) -> CalibrationEstimate:
+    """Choose the estimate of a camera's pair with the most captures."""
+    return max((e for (name, _), e in cameras.items() if name == camera), key=lambda e: len(e.used))
 
 
 def _donor(
@@ -288,7 +288,7 @@ def _conflicts(seen: Sequence[_Seen]) -> dict[str, Refusal]:
     conflicts = {}
     for each in seen:
         for lidar, found in each.boards.items():
-            key = found.points.tobytes()
+            key = board_key(found)
             other, held = surfaces.setdefault((each.capture, lidar), (each, key))
             if held != key:
                 first, second = _other_sensor(other, lidar), _other_sensor(each, lidar)
@@ -312,7 +312,7 @@ def _number_frames(seen: Sequence[_Seen]) -> dict[str, int]:
     scans: dict[tuple[str, bytes], str] = {}
     for each in seen:
         for lidar, found in each.boards.items():
-            first = scans.setdefault((lidar, found.points.tobytes()), each.capture)
+            first = scans.setdefault((lidar, board_key(found)), each.capture)
             one, other = sorted((root(first), root(each.capture)))
             same[other] = one
     numbers = {name: k for k, name in enumerate(sorted({root(each.capture) for each in seen}))}
@@ -349,10 +349,7 @@ def _weigh_cameras(
     """Give each camera's images their own errors: the images, and the levels, geometric means of all."""
     if not names:
         return [], {}
-    figures = [
-        max((e for pair, e in cameras.items() if pair[0] == name), key=lambda e: len(e.used)).diagnostics
-        for name in names
-    ]
+    figures = [_main_estimate(name, cameras).diagnostics for name in names]
     logs = np.log(
         [
             [np.radians(d.noise_tilt_deg), np.radians(d.noise_spin_deg), d.noise_depth_m, d.noise_across_m]

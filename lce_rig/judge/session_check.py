@@ -10,7 +10,7 @@ import numpy as np
 
 from lce_rig.calibrate import Clocks
 from lce_rig.calibrate.motion.board_motion import compensate, fit_motions, sample_poses
-from lce_rig.calibrate.observations import SharedScan
+from lce_rig.calibrate.observations import SharedScan, scan_key
 from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, ChannelResult, Metrics, SceneOpinion
@@ -77,15 +77,12 @@ def bring_together(
     by_scan: dict[bytes, dict[str, ImageBoard]] = {}
     for name in sorted(timed, key=lambda name: of_channel[name].noise_px):
         for o in timed[name]:
-            by_scan.setdefault(o.lidar.points.tobytes(), {}).setdefault(name, o.image)
+            by_scan.setdefault(scan_key(o), {}).setdefault(name, o.image)
     own = list(timed[channel])
     if not own:
         return {}
     # A capture's own image counts, if several hold the same scan.
-    scans = [
-        SharedScan((o.capture,), {**by_scan[o.lidar.points.tobytes()], channel: o.image}, o.lidar)
-        for o in own
-    ]
+    scans = [SharedScan((o.capture,), {**by_scan[scan_key(o)], channel: o.image}, o.lidar) for o in own]
     samples = sample_poses(scans, clocks, {name: of_channel[name].noise_px for name in timed})
     offset_s = np.array([of_channel[name].time_offset_s for name in samples.channels], dtype=np.float64)
     only = channel if len(samples.channels) > 1 else None

@@ -185,6 +185,11 @@ class RigEstimate(Optimum):
         held = [each.held for each in self.priors]
         return replace(assemble_rig(self.terms, self.levels, held).cost, placement=self.placement)
 
+    @cached_property
+    def left_out(self) -> Array:
+        """Shifts (P, G) of z without each of the placements."""
+        return self.cost.moves()
+
     @property
     def profiled(self) -> dict[str, tuple[Indices, float]]:
         """Places in z and standard deviation of each error of lens and board, by name."""
