@@ -79,6 +79,7 @@ class CalibrationEstimate:
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
+        lens_of_base: the same of a camera in the LiDAR's place.
         cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -99,6 +100,7 @@ class CalibrationEstimate:
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
     lens: SessionLens | None = None
+    lens_of_base: SessionLens | None = None
     cov_with_lens: Array = field(default_factory=lambda: np.zeros((6, 0)))
     joint: tuple[JointEstimate, int] | None = None
     estimated_with: tuple[str, ...] = ()

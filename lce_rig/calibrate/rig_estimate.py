@@ -7,9 +7,11 @@ they do to all.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from lce_rig.calibrate.between_cameras import StereoPair
 from lce_rig.calibrate.between_lidars import LidarPair
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.calibrate.likelihood.fit import JointEstimate
@@ -22,11 +24,11 @@ from lce_rig.calibrate.observations import board_key, group_poses
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
 from lce_rig.calibrate.session_lens import SessionLens
-from lce_rig.calibrate.uncertainty import widen, with_errors
+from lce_rig.calibrate.uncertainty import widen, with_errors, without_lidar
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation, PatternBoard
 
 SensorPair = tuple[str, str]
 """Names of a camera and a LiDAR, or of two LiDARs."""
@@ -37,7 +39,7 @@ class RigResult:
     """Poses of the sensors of a rig.
 
     Attributes:
-        cameras, lidars: their names; the first LiDAR is the base.
+        cameras, lidars: their names; the first LiDAR is the base, without LiDARs the first camera.
         estimates: of each pair that was given; two LiDARs' is of the second in an optical frame of the first.
         joint: the estimate of all.
     """
@@ -78,7 +80,7 @@ class _Seen:
 
 def estimate_rig(
     cameras: Mapping[SensorPair, CalibrationEstimate],
-    between: Mapping[SensorPair, LidarPair],
+    between: Mapping[SensorPair, LidarPair | StereoPair],
     board: Board,
     lidars: Sequence[str],
 ) -> RigResult:
@@ -88,28 +90,31 @@ def estimate_rig(
 
     Args:
         cameras: estimates by the likelihood of cameras and LiDARs whose boards stood still.
-        between: pairs of LiDARs. All pairs together connect all sensors.
+        between: pairs of LiDARs, and of cameras. All pairs together connect all sensors.
         board: its specification.
         lidars: names in the order of the profile.
     """
     held = {name for pair in (*cameras, *between) for name in pair}
     of_lidars = tuple(name for name in lidars if name in held)
     of_cameras = tuple(sorted(held - set(of_lidars)))
-    lenses = {camera: _main_estimate(camera, cameras).lens for camera in of_cameras}
+    known = {camera: _known_of(camera, cameras, between) for camera in of_cameras}
+    lenses = {camera: each.lens for camera, each in known.items()}
     seen = list(_list_seen(cameras, between, lenses))
     conflicts = _conflicts(seen)
     frames = _Frames.of([each for each in seen if each.capture not in conflicts], of_cameras, of_lidars)
-    T_start = _spanning_poses(cameras, between, of_lidars[0])
+    bases = of_lidars or of_cameras[:1]
+    T_start = _spanning_poses(cameras, between, bases[0])
     T_base_board = frames.place(T_start)
     images, image_levels = _weigh_cameras(
-        of_cameras, [frames.stack_images(name, board, lenses[name]) for name in of_cameras], cameras
+        [frames.stack_images(name, board, lenses[name]) for name in of_cameras], list(known.values())
     )
-    scans = [frames.stack_scans(name, board) for name in of_lidars]
-    donors = [_donor(name, cameras, between) for name in of_lidars]
+    scans = [frames.stack_scans(name, board) for name in bases]
+    donors = [_donor(name, cameras, between) for name in bases]
     states: list[State] = []
-    for name, scan, donor in zip(of_lidars, scans, donors, strict=True):
+    for name, scan, donor in zip(bases, scans, donors, strict=True):
         T_cam = np.array([T_start[each] for each in of_cameras if not states]).reshape(-1, 4, 4)
-        layout = Layout([] if states else [each.turns.shape[1] for each in images], len(scan.rings))
+        n_optics = [] if states else [each.turns.shape[1] for each in images]
+        layout = Layout(n_optics, len(scan.rings), base=None if of_lidars else 0)
         z = donor.state.common_to(layout, donor.terms.scans.rings, scan.rings)
         if states:
             base = states[0]
@@ -120,7 +125,7 @@ def estimate_rig(
         images,
         board,
         states,
-        np.array([T_start[name] for name in of_lidars]),
+        np.array([T_start[name] for name in bases]),
         [replace(donor.levels, **image_levels) for donor in donors],
         [donor.priors for donor in donors],
         group_poses(T_base_board),
@@ -145,6 +150,14 @@ def estimate_rig(
     for pair, given in between.items():
         start = _start_of(given.start, conflicts)
         T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
+        if isinstance(given, StereoPair):
+            estimates[pair] = replace(
+                _report(result, pair[1], start, T, J, board, frames.numbers(start)),
+                lens=lenses[pair[0]],
+                lens_of_base=lenses[pair[1]],
+                joint=(given.joint, 0),
+            )
+            continue
         J = np.kron(np.eye(2), given.T_view[:3, :3]) @ J
         estimates[pair] = replace(
             _report(result, pair[1], start, given.T_view @ T, J, board, frames.numbers(start), True),
@@ -196,10 +209,13 @@ class _Frames:
         found = [self.images[camera][frame] for frame in frames]
         return stack_images(np.array(frames), found, board.pattern_offset_m, lens)
 
-    def stack_scans(self, lidar: str, board: Board) -> StackedScans:
-        """Stack a LiDAR's scans."""
-        frames = sorted(self.boards[lidar])
-        found = [interior(self.boards[lidar][frame], board) for frame in frames]
+    def stack_scans(self, base: str, board: Board) -> StackedScans:
+        """Stack a LiDAR's scans; those of a camera that is the base have no returns."""
+        boards = self.boards.get(base) or {
+            frame: PatternBoard.of(image, board.corners()) for frame, image in self.images[base].items()
+        }
+        frames = sorted(boards)
+        found = [interior(boards[frame], board) for frame in frames]
         return spread(stack_scans(found, board), np.array(frames), self.n)
 
     def place(self, T_start: Mapping[str, Array]) -> Array:
@@ -220,7 +236,7 @@ class _Frames:
 
 def _report(
     result: RigResult,
-    lidar: str,
+    second: str,
     start: Start,
     T: Array,
     J: Array,
@@ -229,7 +245,8 @@ def _report(
     is_of_lidars: bool = False,
 ) -> CalibrationEstimate:
     """Report a pose T (4, 4) with the derivative J (6, G) as the estimate of a pair."""
-    joint, m = result.joint, result.lidars.index(lidar)
+    joint, is_of_cameras = result.joint, second not in result.lidars
+    m = 0 if is_of_cameras else result.lidars.index(second)
     scatter, constants = (J @ each @ J.T for each in joint.covariances)
     if is_of_lidars:
         constants = constants + joint.of_model(J)
@@ -238,9 +255,10 @@ def _report(
     cov, inflation = widen(scatter + constants, left_out, n_placements)
     part, at = joint.terms.parts[m], joint.terms.places[m]
     shift = at[part.state.layout.z["shifts"]][0]
-    figures = with_errors(
-        start.diagnostics, joint.levels[m], part.state, float(np.sqrt(joint.cov_z[shift, shift])), inflation
-    )
+    shift_sigma_m = float(np.sqrt(joint.cov_z[shift, shift]))
+    figures = with_errors(start.diagnostics, joint.levels[m], part.state, shift_sigma_m, inflation)
+    if is_of_cameras:
+        figures = without_lidar(figures)
     if result.cameras:
         figures = replace(figures, camera_scale=1.0 - joint.terms.base.state.squares)
     estimate = report(start, T, cov, board, with_parts(figures, scatter, constants))
@@ -248,25 +266,56 @@ def _report(
     return replace(estimate, method="ml", sensitivities=moves)
 
 
-def _main_estimate(camera: str, cameras: Mapping[SensorPair, CalibrationEstimate]) -> CalibrationEstimate:
-    """Choose the estimate of a camera's pair with the most captures."""
-    return max((e for (name, _), e in cameras.items() if name == camera), key=lambda e: len(e.used))
+class _Known(NamedTuple):
+    """A camera by the pair that tells most of it: lens, and errors of its images by level."""
+
+    lens: SessionLens | None
+    levels: Mapping[str, float]
+
+
+def _known_of(
+    camera: str,
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+    between: Mapping[SensorPair, LidarPair | StereoPair],
+) -> _Known:
+    """Choose the pair of a camera with the most captures, one with a LiDAR if there is any."""
+    of_lidars = [e for pair, e in cameras.items() if camera in pair]
+    if of_lidars:
+        d = max(of_lidars, key=lambda e: len(e.used)).diagnostics
+        tilt_rad, spin_rad = np.radians([d.noise_tilt_deg, d.noise_spin_deg]).tolist()
+        values = tilt_rad, spin_rad, d.noise_depth_m, d.noise_across_m
+        lens = max(of_lidars, key=lambda e: len(e.used)).lens
+        return _Known(lens, dict(zip(OF_IMAGES, values, strict=True)))
+    pairs = [
+        (len(each.start.observations), pair, each)
+        for pair, each in between.items()
+        if camera in pair and isinstance(each, StereoPair)
+    ]
+    _, pair, stereo = max(pairs, key=lambda each: each[0])
+    levels = {name: float(getattr(stereo.joint.levels, name)) for name in OF_IMAGES}
+    return _Known(stereo.lenses[pair.index(camera)], levels)
 
 
 def _donor(
-    lidar: str, cameras: Mapping[SensorPair, CalibrationEstimate], between: Mapping[SensorPair, LidarPair]
+    base: str,
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+    between: Mapping[SensorPair, LidarPair | StereoPair],
 ) -> JointEstimate:
-    """Choose the estimate of a pair that tells most of a LiDAR's errors and noise."""
-    found = [(len(e.used), e.joint[0]) for (_, name), e in cameras.items() if name == lidar and e.joint]
+    """Choose the estimate of a pair that tells most of a LiDAR's errors and noise, or of a base camera's."""
+    found = [(len(e.used), e.joint[0]) for (_, name), e in cameras.items() if name == base and e.joint]
     if found:
         return max(found, key=lambda each: each[0])[1]
-    alone = [given.alone[pair.index(lidar)] for pair, given in between.items() if lidar in pair]
+    alone = [
+        given.joint if isinstance(given, StereoPair) else given.alone[pair.index(base)]
+        for pair, given in between.items()
+        if base in pair
+    ]
     return max(alone, key=lambda each: len(each.placement))
 
 
 def _list_seen(
     cameras: Mapping[SensorPair, CalibrationEstimate],
-    between: Mapping[SensorPair, LidarPair],
+    between: Mapping[SensorPair, LidarPair | StereoPair],
     lenses: Mapping[str, SessionLens | None],
 ) -> Iterator[_Seen]:
     """List what each pair saw in the captures that it uses, images with the lens of all."""
@@ -278,8 +327,29 @@ def _list_seen(
         for o in observations:
             yield _Seen(pair, o.capture, {pair[1]: o.lidar}, o.image)
     for pair, given in sorted(between.items(), key=lambda each: each[0]):
+        if isinstance(given, StereoPair):
+            yield from _list_images(pair, given, lenses)
+            continue
         for name, both in given.boards.items():
             yield _Seen(pair, name, dict(zip(pair, both, strict=True)), None)
+
+
+def _list_images(
+    pair: SensorPair, given: StereoPair, lenses: Mapping[str, SessionLens | None]
+) -> Iterator[_Seen]:
+    """List what two cameras saw."""
+    first = list(given.start.observations)
+    boards = [o.lidar.image for o in first if isinstance(o.lidar, PatternBoard)]
+    second = [replace(o, image=image) for o, image in zip(first, boards, strict=True) if image is not None]
+    for name, observations, lens in zip(pair, (first, second), given.lenses, strict=True):
+        best = lenses[name]
+        found = observations if best is None or best is lens else best.refit(observations)
+        for o in found:
+            yield _Seen((name, _other_of(pair, name)), o.capture, {}, o.image)
+
+
+def _other_of(pair: SensorPair, name: str) -> str:
+    return pair[1] if pair[0] == name else pair[0]
 
 
 def _conflicts(seen: Sequence[_Seen]) -> dict[str, Refusal]:
@@ -291,13 +361,9 @@ def _conflicts(seen: Sequence[_Seen]) -> dict[str, Refusal]:
             key = board_key(found)
             other, held = surfaces.setdefault((each.capture, lidar), (each, key))
             if held != key:
-                first, second = _other_sensor(other, lidar), _other_sensor(each, lidar)
+                first, second = _other_of(other.pair, lidar), _other_of(each.pair, lidar)
                 conflicts[each.capture] = TWO_PLACES.refusal(first=first, second=second)
     return conflicts
-
-
-def _other_sensor(seen: _Seen, lidar: str) -> str:
-    return next(name for name in seen.pair if name != lidar)
 
 
 def _number_frames(seen: Sequence[_Seen]) -> dict[str, int]:
@@ -320,14 +386,17 @@ def _number_frames(seen: Sequence[_Seen]) -> dict[str, int]:
 
 
 def _spanning_poses(
-    cameras: Mapping[SensorPair, CalibrationEstimate], between: Mapping[SensorPair, LidarPair], base: str
+    cameras: Mapping[SensorPair, CalibrationEstimate],
+    between: Mapping[SensorPair, LidarPair | StereoPair],
+    base: str,
 ) -> dict[str, Array]:
     """Compose each sensor's T_sensor_base (4, 4) along the pairs with the most captures."""
     edges = [(len(e.used), pair, e.T_cam_lidar) for pair, e in cameras.items()]
-    edges += [
-        (len(given.boards), pair, invert(given.T_view) @ given.start.T_cam_lidar)
-        for pair, given in between.items()
-    ]
+    for pair, given in between.items():
+        T_first_second = given.start.T_cam_lidar
+        if not isinstance(given, StereoPair):
+            T_first_second = invert(given.T_view) @ T_first_second
+        edges.append((len(given.start.observations), pair, T_first_second))
     edges.sort(key=lambda edge: (-edge[0], edge[1]))
     found = {base: np.eye(4)}
     for _ in edges:
@@ -342,20 +411,12 @@ def _spanning_poses(
 
 
 def _weigh_cameras(
-    names: Sequence[str],
-    stacked: Sequence[StackedImages],
-    cameras: Mapping[SensorPair, CalibrationEstimate],
+    stacked: Sequence[StackedImages], known: Sequence[_Known]
 ) -> tuple[list[StackedImages], dict[str, float]]:
     """Give each camera's images their own errors: the images, and the levels, geometric means of all."""
-    if not names:
+    if not known:
         return [], {}
-    figures = [_main_estimate(name, cameras).diagnostics for name in names]
-    logs = np.log(
-        [
-            [np.radians(d.noise_tilt_deg), np.radians(d.noise_spin_deg), d.noise_depth_m, d.noise_across_m]
-            for d in figures
-        ]
-    )
+    logs = np.log([[each.levels[name] for name in OF_IMAGES] for each in known])
     mean = logs.mean(axis=0)
     scaled = [
         images.with_larger_errors(dict(zip(OF_IMAGES, own, strict=True)))

@@ -1,5 +1,6 @@
 """Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -250,6 +251,13 @@ def with_errors(
         noise_depth_m=levels.depth_m,
         noise_across_m=levels.across_m,
     )
+
+
+def without_lidar(figures: Diagnostics) -> Diagnostics:
+    """Remove the figures of a LiDAR and its ring ends."""
+    names = ("edge_shift", "range_offset", "laser_spread", "lens_vertical", "noise_range")
+    unknown = {name: math.nan for name in figures.figures() if name.startswith(names)}
+    return replace(figures, **unknown)
 
 
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:

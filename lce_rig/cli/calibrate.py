@@ -48,9 +48,10 @@ _N_REASONS, _FAR_M = 3, 10.0
 
 
 def residual_words(metrics: Metrics, c: Calibration) -> str:
-    """Write mean residuals; two LiDARs have none of corners."""
+    """Write mean residuals; two LiDARs have none of corners, two cameras none of edges."""
+    edges = "" if c.is_of_cameras else f", edges {1000 * metrics.mee_m:.1f} mm"
     corners = "" if c.is_of_lidars else f", corners {metrics.reprojection_px:.2f} px"
-    return f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm{corners}"
+    return f"planes {1000 * metrics.mpe_m:.1f} mm{edges}{corners}"
 
 
 def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
@@ -360,7 +361,7 @@ def _parts(
         more = show.counted(len(fresh) - n_shown, "more reason")
         yield f"  {more} in report.html and by lce-rig calibrate {path} --explain"
     if is_explained or not (has_failed or is_of_rig):
-        target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
+        target, source = (c.camera, c.lidar) if c.is_of_peers else ("cam", "lidar")
         yield show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
         yield from show.matrix_lines(c.T_cam_lidar, "    ")
     yield from _uncertainty(c, is_by_axis=is_explained or not is_of_rig)

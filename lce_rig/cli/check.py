@@ -46,8 +46,8 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
             folder = write_debug_images(opened, detections, progress=progress)
         show.note(f"debug images: {folder}")
     documents, n_usable, is_contradicted = [], 0, False
-    for pair in [*detections.pairs, *detections.lidar_pairs(opened.rig.lidars)]:
-        seen = detections.between(pair)
+    for pair in [*detections.pairs, *detections.peers(opened.rig.lidars)]:
+        seen = detections.between(pair, opened.rig.board.to_board())
         refused, _ = match_sensors(opened.rig, seen, pair)
         plates = _plates(opened.rig, seen, pair, refused)
         usable = [each for each in candidates_of(seen, pair)[0] if each.capture not in refused]

@@ -119,7 +119,7 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
     """
     opened = with_profile_of(lce.Session.open(session), name)
     pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
-    pairs = tuple(c for c in pairs if not c.is_of_lidars)
+    pairs = tuple(c for c in pairs if not c.is_of_peers)
     if not pairs:
         raise UsageError("the result has no camera whose colours could be shown", "Look at `lce-rig verify`.")
     # Cameras that share the first one's LiDAR.

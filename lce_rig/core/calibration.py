@@ -356,12 +356,15 @@ class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
     Of two LiDARs, `camera` names the first of the profile, which has no channel: T_cam_lidar takes points
-    from the second one's frame to the first's, and all axes of the camera are those of the first LiDAR.
+    from the second one's frame to the first's, and all axes of the camera are those of the first LiDAR. Of
+    two cameras, `lidar` names the second, which has a channel: T_cam_lidar takes points from its optical
+    frame to the first one's.
 
     result.json keeps all of it but the last three attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
+        lidar_channel: of a second camera; "" for a LiDAR.
         channel_results: time offset and noise of each of these.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
@@ -382,6 +385,7 @@ class Calibration:
         other_cameras: those that saw the same boards held still.
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
             None in files of earlier versions, whose extrinsics belong to the profile's.
+        lidar_intrinsics: of a second camera, likewise; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
         square_m: the side of a square by the profile and the LiDAR.
@@ -405,6 +409,7 @@ class Calibration:
     lidar: str
     T_cam_lidar: Pose
     cov: Covariance
+    lidar_channel: str = ""
     n_captures: Count
     n_detected: Count
     captures_used: tuple[str, ...]
@@ -426,6 +431,7 @@ class Calibration:
     cov_shared: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     contributions: tuple[Contribution, ...] = ()
     intrinsics: Intrinsics | None = None
+    lidar_intrinsics: Intrinsics | None = None
     intrinsics_cov: Values | None = None
     intrinsics_cross_cov: Values | None = None
     square_m: Size | None = None
@@ -444,6 +450,16 @@ class Calibration:
     def is_of_lidars(self) -> bool:
         """Whether both sensors are LiDARs."""
         return not self.channels
+
+    @property
+    def is_of_cameras(self) -> bool:
+        """Whether both sensors are cameras."""
+        return bool(self.lidar_channel)
+
+    @property
+    def is_of_peers(self) -> bool:
+        """Whether both sensors are of one kind."""
+        return self.is_of_lidars or self.is_of_cameras
 
     @property
     def is_start_certified(self) -> bool:
@@ -487,7 +503,7 @@ def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, 
             mpe_m, mee_m = value["mpe_m"], value["mee_m"]
             mge_m = None if None in (mpe_m, mee_m) else calibration.metrics.mge_m
             pair |= {"mpe_m": mpe_m, "mee_m": mee_m, "mge_m": mge_m, **value}
-        else:
+        elif value or not name.startswith("lidar_"):
             pair[name] = dict(sorted(value.items())) if name == "captures_refused" else value
         if name == "cov":
             pair["sigma_rotation_deg"] = calibration.sigma_rotation_deg

@@ -207,6 +207,70 @@ class LidarBoard:
 
 
 @dataclass(frozen=True, eq=False)
+class PatternBoard(LidarBoard):
+    """The board in an image of another camera: its corners are the points, and it has no ring ends.
+
+    Attributes:
+        image: the detection.
+    """
+
+    image: ImageBoard | None = None
+
+    @classmethod
+    def of(cls, image: ImageBoard, corners: Array) -> "PatternBoard":
+        """Put the corners of a board (N, 3), frame board, where an image has it, frame of its camera.
+
+        Args:
+            image: the detection.
+            corners: `Board.corners()`.
+        """
+        T, is_seen = image.T_cam_board, np.isfinite(image.corners_px[:, 0])
+        points = corners[is_seen] @ T[:3, :3].T + T[:3, 3]
+        n, none, unknown = len(points), np.zeros(0), math.nan
+        quality = LidarQuality(
+            width_m=unknown,
+            height_m=unknown,
+            width_sigma_m=math.inf,
+            height_sigma_m=math.inf,
+            n_rings=0,
+            n_points=n,
+            n_ring_ends=0,
+            n_ring_ends_dropped=0,
+            plane_rms_m=unknown,
+            edge_rms_m=unknown,
+            template_m=unknown,
+            beyond_share=0.0,
+            distance_m=image.distance_m,
+        )
+        normal = -T[:3, 2] * np.sign(T[:3, 2] @ T[:3, 3])
+        return cls(
+            points=points,
+            ring=np.full(n, NO_RING, dtype=np.int16),
+            edge_points=np.zeros((0, 3)),
+            edge_ring=np.zeros(0, dtype=np.int16),
+            edge_side=np.zeros(0, dtype=np.int8),
+            edge_behind_m=none,
+            edge_echo=none,
+            azimuth_step_rad=1.0,
+            plane=np.append(normal, -normal @ T[:3, 3]),
+            sigma_m=1.0,
+            T_lidar_board=T,
+            quality=quality,
+            stamp_ns=image.stamp_ns,
+            image=image,
+        )
+
+
+    @classmethod
+    def candidates(cls, image: ImageBoard, corners: Array) -> list[LidarBoard]:
+        """List the poses that an image leaves open; arguments as of `of`."""
+        poses = [image.T_cam_board]
+        if image.T_cam_board_alternative is not None:
+            poses.append(image.T_cam_board_alternative)
+        return [cls.of(replace(image, T_cam_board=T), corners) for T in poses]
+
+
+@dataclass(frozen=True, eq=False)
 class Observation:
     """One board placement seen by one camera channel and one LiDAR."""
 

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Refusal
-from lce_rig.core.results import EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality, PatternBoard
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
@@ -73,24 +75,36 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
 
 @dataclass(frozen=True)
 class Pair:
-    """One camera channel and one LiDAR of a rig; or two LiDARs, the first as the camera, without channel."""
+    """One camera channel and one LiDAR of a rig; or two sensors of one kind, the second as the LiDAR.
+
+    Attributes:
+        camera: a camera; the first of two LiDARs.
+        channel: of the camera; "" for a LiDAR.
+        lidar: a LiDAR; the second of two cameras.
+        lidar_channel: of the second camera; "" for a LiDAR.
+    """
 
     camera: str
     channel: str
     lidar: str
+    lidar_channel: str = ""
 
     @classmethod
     def of(cls, calibration: Calibration) -> "Pair":
         """Return the sensors of a calibration."""
-        return cls(calibration.camera, calibration.channel, calibration.lidar)
+        return cls(calibration.camera, calibration.channel, calibration.lidar, calibration.lidar_channel)
 
     @property
     def folder_name(self) -> str:
         """Name of the folder of this pair's files if there are several pairs."""
-        return ".".join(filter(None, (self.camera, self.channel, self.lidar)))
+        return ".".join(filter(None, (self.camera, self.channel, self.lidar, self.lidar_channel)))
 
     def __str__(self) -> str:
-        return f"{self.camera}{'.' if self.channel else ''}{self.channel} and {self.lidar}"
+        first, second = (
+            ".".join(filter(None, names))
+            for names in ((self.camera, self.channel), (self.lidar, self.lidar_channel))
+        )
+        return f"{first} and {second}"
 
 
 @dataclass(frozen=True)
@@ -123,11 +137,39 @@ class Detections:
             if self.lidars.get(first, {}).keys() & self.lidars.get(second, {}).keys()
         ]
 
-    def between(self, pair: Pair) -> "Detections":
-        """Put the first of two LiDARs into a camera's place: its boards are poses, as those in images are.
+    def camera_pairs(self) -> list[Pair]:
+        """List every two cameras that share captures, each by the channel that has the most boards."""
+        best: dict[str, tuple[str, set[str]]] = {}
+        for (camera, channel), images in sorted(self.images.items()):
+            found = {name for name, image in images.items() if isinstance(image, ImageBoard)}
+            if camera not in best or len(found) > len(best[camera][1]):
+                best[camera] = channel, found
+        return [
+            Pair(first, best[first][0], second, best[second][0])
+            for first, second in combinations(sorted(best), 2)
+            if best[first][1] & best[second][1]
+        ]
 
-        Other pairs are given back unchanged.
+    def peers(self, lidars: Iterable[str]) -> list[Pair]:
+        """List every two of the LiDARs named, and every two cameras of which one shares no LiDAR's scan."""
+        with_lidar = {pair.camera for pair in self.pairs}
+        of_cameras = [p for p in self.camera_pairs() if not {p.camera, p.lidar} <= with_lidar]
+        return [*self.lidar_pairs(lidars), *of_cameras]
+
+    def between(self, pair: Pair, board: Board) -> "Detections":
+        """Put the first of two LiDARs into a camera's place, or the second of two cameras into a LiDAR's.
+
+        Boards in scans are poses, as those in images are; those in images are points. Other pairs are given
+        back unchanged.
+
+        Args:
+            pair: the sensors.
+            board: whose corners are points.
         """
+        if pair.lidar_channel:
+            seen, corners = self.images[pair.lidar, pair.lidar_channel], board.corners()
+            boards = {name: _as_scan(image, corners) for name, image in seen.items()}
+            return replace(self, lidars={pair.lidar: boards})
         if pair.channel:
             return self
         images = {name: _as_image(found) for name, found in self.lidars[pair.camera].items()}
@@ -135,11 +177,17 @@ class Detections:
 
     def captures(self, pair: Pair) -> list[str]:
         """Name the captures in which both sensors of a pair have a sample, sorted."""
-        return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
+        images = self.images.get((pair.camera, pair.channel), {})
+        return sorted(images.keys() & self.lidars.get(pair.lidar, {}).keys())
 
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
         """Return the detections of both sensors of a pair in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]
+
+
+def _as_scan(found: ImageDetection, corners: Array) -> LidarDetection:
+    """Give the poses that an image leaves open as a scan's candidates."""
+    return found if isinstance(found, Refusal) else PatternBoard.candidates(found, corners)
 
 
 def _as_image(found: LidarDetection) -> ImageDetection:

@@ -66,8 +66,8 @@ class ExportJob:
 
     @property
     def of_cameras(self) -> list[Calibration]:
-        """The calibrations that are not of two LiDARs."""
-        return [c for c in self.calibrations if not c.is_of_lidars]
+        """The calibrations of a camera and a LiDAR."""
+        return [c for c in self.calibrations if not c.is_of_peers]
 
     @cached_property
     def trees(self) -> list[RobotTree]:

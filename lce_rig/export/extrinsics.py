@@ -27,7 +27,7 @@ def export_extrinsics(job: ExportJob) -> list[Path]:
 
 def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
     """List the sensors, the verdict, the pose with its inverse and its covariance."""
-    lidar, inverse = rig.lidars[c.lidar].frame, invert(c.T_cam_lidar)
+    lidar, inverse = rig.frame_of(c.lidar), invert(c.T_cam_lidar)
     points: tuple[dict[str, Any], dict[str, Any]] = {}, {}
     if c.is_of_lidars:
         first = rig.lidars[c.camera].frame
@@ -37,6 +37,15 @@ def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
         forward = f"takes points from {lidar} to {first}: p_lidar = R p_other + t"
         forward += f"; the pose of {lidar} in {first}"
         backward = f"takes points from {first} to {lidar}: p_other = R p_lidar + t"
+    elif c.is_of_cameras:
+        first, second = rig.cameras[c.camera].optical_frame, rig.cameras[c.lidar].optical_frame
+        axes = f"the axes of {first}"
+        names = {"camera": c.camera, "channel": c.channel, "other_camera": c.lidar}
+        names |= {"camera_frame": first, "other_camera_frame": second}
+        poses = "T_cam_other", "T_other_cam"
+        forward = f"takes points from {second} to {first} (both x right, y down, z forward): "
+        forward += f"p_cam = R p_other + t; the pose of {second} in {first}"
+        backward = f"takes points from {first} to {second}: p_other = R p_cam + t"
     else:
         camera, axes = rig.cameras[c.camera], "the optical frame's axes"
         names = {"camera": c.camera, "channel": c.channel, "lidar": c.lidar}
@@ -48,9 +57,8 @@ def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
         backward = f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t"
         backward += "; the camera's pose on the LiDAR"
     # Points are used less this much of their range.
-    offsets_m = {"lidar": rig.lidars[c.lidar].range_offset_m}
-    if c.is_of_lidars:
-        offsets_m = {"lidar": rig.lidars[c.camera].range_offset_m, "other_lidar": offsets_m["lidar"]}
+    at = {"lidar": c.camera, "other_lidar": c.lidar} if c.is_of_lidars else {"lidar": c.lidar}
+    offsets_m = {key: rig.lidars[name].range_offset_m for key, name in at.items() if name in rig.lidars}
     subtracted = {f"{name}_range_offset_m": value for name, value in offsets_m.items() if value}
     proven = "start_is_globally_optimal" if c.is_start_certified else "is_globally_optimal"
     return {

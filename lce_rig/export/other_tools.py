@@ -111,19 +111,44 @@ def export_kalibr(job: ExportJob) -> list[Path]:
             lens, lines = lenses[c.camera]
             head += [f"cam{index}: {line}" for line in lines]
             link = {"T_cn_cnm1": c.T_cam_lidar @ invert(chain[index - 1].T_cam_lidar)} if index else {}
-            document[f"cam{index}"] = link | {
+            document[f"cam{index}"] = {
+                **link,
                 "T_cam_lidar": c.T_cam_lidar,
-                "cam_overlaps": [i for i in range(len(chain)) if i != index],
-                "camera_model": "pinhole",
-                "distortion_coeffs": lens.distortion,
-                "distortion_model": lens.model,
-                "intrinsics": _matrix(lens),
-                "resolution": [lens.width_px, lens.height_px],
+                **_kalibr_lens(lens, index, len(chain)),
                 "rostopic": job.image_topic(c),
             }
         if chain:
             paths.append(job.write_yaml(f"camchain_{lidar}.yaml", head, document))
-    return paths
+    return paths or _stereo_chain(job)
+
+
+def _stereo_chain(job: ExportJob) -> list[Path]:
+    """Write camchain.yaml of cameras without a LiDAR."""
+    pairs = [c for c in job.calibrations if c.is_of_cameras]
+    if not pairs:
+        return []
+    first = pairs[0].camera
+    T_first = {first: np.eye(4)} | {c.lidar: c.T_cam_lidar for c in pairs if c.camera == first}
+    names, document = list(T_first), {}
+    head = job.head("Kalibr camchain", *pairs)
+    for index, name in enumerate(names):
+        lens, lines = lens_for(job, "kalibr", name, "radtan4")
+        head += [f"cam{index}: {line}" for line in lines]
+        link = {"T_cn_cnm1": invert(T_first[name]) @ T_first[names[index - 1]]} if index else {}
+        document[f"cam{index}"] = link | _kalibr_lens(lens, index, len(names))
+    return [job.write_yaml("camchain.yaml", head, document)]
+
+
+def _kalibr_lens(lens: Intrinsics, index: int, n_cameras: int) -> dict[str, Any]:
+    """List a camera of the chain."""
+    return {
+        "cam_overlaps": [i for i in range(n_cameras) if i != index],
+        "camera_model": "pinhole",
+        "distortion_coeffs": lens.distortion,
+        "distortion_model": lens.model,
+        "intrinsics": _matrix(lens),
+        "resolution": [lens.width_px, lens.height_px],
+    }
 
 
 def export_koide3(job: ExportJob) -> list[Path]:

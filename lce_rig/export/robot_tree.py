@@ -17,7 +17,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
 from lce_rig.export.writing import T_BODY_OPTICAL
-from lce_rig.rig import Rig
+from lce_rig.rig import CameraSettings, Rig
 
 
 class Joint(NamedTuple):
@@ -183,7 +183,7 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
     is_known = camera is not None and set(calibration.channels) <= set(camera.channels)
     if calibration.is_of_lidars:
         is_known = calibration.camera in rig.lidars
-    if not is_known or calibration.lidar not in rig.lidars:
+    if not is_known or calibration.lidar not in (rig.cameras if calibration.is_of_cameras else rig.lidars):
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
         what = f"the result is for {pair}, which rig {rig.name} does not have"
         raise LceRigError(what, "Use the profile that the session was made with.")
@@ -232,8 +232,7 @@ def fit_tree(
         placed = [min(present, key=lambda frame: len(tree.chain(frame)))]
         for anchor in placed:  # which grows
             for calibration in calibrations:
-                lidar = rig.lidars[calibration.lidar].frame
-                camera = bodies[calibration.camera]
+                lidar, camera = bodies[calibration.lidar], bodies[calibration.camera]
                 if anchor in (lidar, camera) and not {lidar, camera} <= set(placed):
                     tree, placing = _placed(tree, calibration, rig, anchor)
                     changes += placing
@@ -306,14 +305,34 @@ def _placed(
     tree: RobotTree, calibration: Calibration, rig: Rig, anchor: str
 ) -> tuple[RobotTree, list[JointChange]]:
     """Put the other sensor of a calibration where it belongs, beside the one that is placed."""
-    lidar = rig.lidars[calibration.lidar].frame
-    if calibration.is_of_lidars:
-        first, T = rig.lidars[calibration.camera].frame, calibration.T_cam_lidar
-        joint = _place(tree, first, lidar, T) if anchor == first else _place(tree, lidar, first, invert(T))
-        above = tree.above.get(joint.child)
-        return tree.with_joint(joint), [JointChange(joint, None if above is None else above.T_parent_child)]
-    camera = rig.cameras[calibration.camera]
-    # The robot's own optical frame, or the standard rotation.
+    first, second = rig.frame_of(calibration.camera), rig.frame_of(calibration.lidar)
+    T_first_second, opticals = calibration.T_cam_lidar, []
+    if calibration.camera in rig.cameras:
+        opticals.append(_optical(tree, rig.cameras[calibration.camera]))
+        T_first_second = opticals[0].T_parent_child @ T_first_second
+    if calibration.lidar in rig.cameras:
+        opticals.append(_optical(tree, rig.cameras[calibration.lidar]))
+        T_first_second = T_first_second @ invert(opticals[1].T_parent_child)
+    if anchor == first:
+        joint = _place(tree, first, second, T_first_second)
+    else:
+        joint = _place(tree, second, first, invert(T_first_second))
+    above = tree.above.get(joint.child)
+    changes = [JointChange(joint, None if above is None else above.T_parent_child)]
+    tree = tree.with_joint(joint)
+    for optical in opticals:
+        if optical.child not in tree.frames:
+            changes.append(JointChange(optical, None))
+            tree = tree.with_joint(optical)
+    return tree, changes
+
+
+def _optical(tree: RobotTree, camera: CameraSettings) -> Joint:
+    """Return the joint of a camera's optical frame: the robot's own, or the standard rotation.
+
+    Raises:
+        SessionError: the robot has the optical frame elsewhere than below the camera's frame.
+    """
     T_body_optical = T_BODY_OPTICAL
     if camera.optical_frame in tree.frames:
         if camera.frame not in tree.frames or camera.frame not in tree.chain(camera.optical_frame):
@@ -322,19 +341,7 @@ def _placed(
                 f"Name the frame above {camera.optical_frame} as this camera's `frame` in the profile.",
             )
         T_body_optical = tree.find_pose(camera.frame, camera.optical_frame)
-    optical = Joint(camera.frame, camera.optical_frame, T_body_optical)
-    T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
-    if anchor == lidar:
-        joint = _place(tree, lidar, camera.frame, T_lidar_body)
-    else:
-        joint = _place(tree, camera.frame, lidar, invert(T_lidar_body))
-    above = tree.above.get(joint.child)
-    changes = [JointChange(joint, None if above is None else above.T_parent_child)]
-    tree = tree.with_joint(joint)
-    if camera.optical_frame not in tree.frames:
-        changes.append(JointChange(optical, None))
-        tree = tree.with_joint(optical)
-    return tree, changes
+    return Joint(camera.frame, camera.optical_frame, T_body_optical)
 
 
 def _place(tree: RobotTree, anchor: str, child: str, T_anchor_child: Array) -> Joint:

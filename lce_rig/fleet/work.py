@@ -202,7 +202,7 @@ def _calibrate(
     saved = result.file()
     row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
     solved = {(c.camera, c.lidar) for c in result.pairs}
-    every = [*detections.pairs, *detections.lidar_pairs(session.rig.lidars)]
+    every = [*detections.pairs, *detections.peers(session.rig.lidars)]
     pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in every)
     # Shortages stand in the order of the pairs they belong to.
     lacking = [

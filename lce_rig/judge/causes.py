@@ -13,7 +13,7 @@ from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import summed_covariance
-from lce_rig.judge.explanations import ALL, MOUNTINGS, SCATTER, Cause, Selected, explain
+from lce_rig.judge.explanations import MOUNTINGS, SCATTER, Cause, Selected, explain
 from lce_rig.judge.findings import (
     BOW,
     DRIFTED,
@@ -46,7 +46,7 @@ def find_causes(
     estimate: CalibrationEstimate,
     rejected: Sequence[Observation],
     target: CalibrationSettings,
-    is_of_lidars: bool,
+    causes: Sequence[Cause],
 ) -> tuple[Selected, ...]:
     """Find errors that explain the captures of an estimate better than noise, up to the first reason.
 
@@ -54,14 +54,16 @@ def find_causes(
         estimate: of any method.
         rejected: captures with the board in both sensors that the estimate does not use.
         target: target standard deviations.
-        is_of_lidars: True for two LiDARs, where only mountings are tested.
+        causes: to test; only mountings for two LiDARs, or two cameras.
     """
     if estimate.joint is None or len(estimate.observations) < _FEWEST:
         return ()
     joint, camera = estimate.joint
     seen = sorted([*estimate.observations.values(), *rejected], key=lambda o: o.capture)
-    hypothesis = at_full_weight(joint, seen, estimate.lens, camera)
-    causes = MOUNTINGS if is_of_lidars else ALL
+    lenses = [estimate.lens]
+    if joint.state.layout.base is not None:
+        lenses.append(estimate.lens_of_base)
+    hypothesis = at_full_weight(joint, seen, lenses, camera)
     found: list[Selected] = []
     for selected in explain(hypothesis, causes):
         found.append(_in_use(selected, estimate))

@@ -205,7 +205,7 @@ def check_session(
         channel: of the calibration's channels.
         scene: the opinion of this session's scene.
     """
-    pair = Pair(calibration.camera, channel, calibration.lidar)
+    pair = replace(Pair.of(calibration), channel=channel)
     board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
     meetings = find_meetings(rig, detections, pair, calibration.T_cam_lidar, calibration.channel_results)
     residuals = [

@@ -15,6 +15,7 @@ from lce_rig.judge.contributions import (
     list_contributions,
     summed_covariance,
 )
+from lce_rig.judge.explanations import ALL, Cause
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, model_findings
 from lce_rig.rig import Rig
 
@@ -52,6 +53,7 @@ def validate(
     lidar: str,
     lens: Intrinsics | None,
     rejected: Sequence[Observation] = (),
+    tested: Sequence[Cause] = ALL,
 ) -> Validation:
     """Check a result on its own captures.
 
@@ -61,11 +63,12 @@ def validate(
         camera, lidar: names of the sensors.
         lens: the camera's, from the profile; None for two LiDARs.
         rejected: captures with the board in both sensors that the estimate does not use.
+        tested: causes that may explain the captures.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
     intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)
-    selected = find_causes(estimate, rejected, rig.calibration, is_of_lidars=lens is None)
+    selected = find_causes(estimate, rejected, rig.calibration, tested)
     causes = cause_findings(selected, estimate, rig, camera, lidar)
     contradictions = [
         *contradiction_of(selected, causes, estimate.used),

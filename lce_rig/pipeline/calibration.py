@@ -1,6 +1,6 @@
 """Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
-detections -> estimate of each camera with each LiDAR, and of every two LiDARs (`lidar_pairs`) -> all sensors
+detections -> estimate of each camera with each LiDAR, and of every two LiDARs or two cameras (`peer_pairs`) -> all sensors
 that agree, as one (`rig_estimate`) -> checks, verdict -> the scene's opinion
 """
 
@@ -51,11 +51,12 @@ from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
-from lce_rig.pipeline.lidar_pairs import (
-    SolvedLidars,
+from lce_rig.pipeline.peer_pairs import (
+    SolvedPeers,
     find_named,
-    judged_lidars,
-    solve_lidar_pairs,
+    judged_peers,
+    list_peers,
+    solve_peers,
     with_estimate,
 )
 from lce_rig.pipeline.result_files import Result
@@ -174,7 +175,7 @@ def calibrate(
         if truth is not None:
             rotation_deg, translation_m = error_to_reference(c.T_cam_lidar, truth)
             c = replace(c, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
-        if c.is_of_lidars:
+        if c.is_of_peers:
             judged.append(c)
             continue
         c = with_opinion(c, hear_scene(session, detections, c))
@@ -226,14 +227,21 @@ def calibrate_detections(
                     where = tuple(plan.figures[key] for key in ("n_captures", "is_enough", "placements"))
                     shortage = replace(shortage, figures={**shortage.figures, "where": where})
             shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
-    between: list[SolvedLidars] = []
+    between: list[SolvedPeers] = []
     if cameras is None and channels is None:
-        between, lacking = solve_lidar_pairs(rig, detections, options or CalibrateOptions(), progress)
+        # A camera has one lens: that of its pair with the most captures.
+        by_size = sorted(alone, key=lambda own: len(own.estimate.used))
+        lenses = {own.camera: own.estimate.lens for own in by_size}
+        peers = list_peers(rig, detections, lenses)
+        between, lacking = solve_peers(
+            rig, detections, peers, options or CalibrateOptions(), lenses, progress
+        )
         shortages += lacking
     if not alone and not between and not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         raise NotEnoughDataError(
-            f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
+            f"the session has no capture with an image{of_cameras} and a scan, or of two sensors of a kind",
+            "Collect captures first.",
         )
     if not alone and not between:
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
@@ -246,7 +254,7 @@ def calibrate_detections(
     for own in between:
         others = [f for loop, f in loops if own.names in loop.pairs]
         others += [finding for names, finding in named if names == own.names]
-        calibrations.append(judged_lidars(rig, own, others))
+        calibrations.append(judged_peers(rig, own, others))
     return name_moved(calibrations), shortages
 
 
@@ -337,7 +345,7 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
 
 
 def _open_loops(
-    rig: Rig, alone: Sequence[_Solved], between: Sequence[SolvedLidars]
+    rig: Rig, alone: Sequence[_Solved], between: Sequence[SolvedPeers]
 ) -> list[tuple[Loop, Finding]]:
     """List loops of three sensors whose poses, each pair's alone, contradict each other.
 
@@ -362,10 +370,10 @@ def _solve_together(
     rig: Rig,
     detections: Detections,
     alone: Sequence[_Solved],
-    between: Sequence[SolvedLidars],
+    between: Sequence[SolvedPeers],
     links: Sequence[_Link],
     loops: Sequence[tuple[Loop, Finding]],
-) -> tuple[list[_Solved], list[SolvedLidars]]:
+) -> tuple[list[_Solved], list[SolvedPeers]]:
     """Estimate sensors that agree as one; leave the others unchanged.
 
     A sensor that contradicts another, or its own captures, is excluded, as it would corrupt the others'

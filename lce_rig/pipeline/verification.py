@@ -7,8 +7,10 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
+
 from lce_rig.core.calibration import Calibration, ResultFile, SceneOpinion, read_result
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
@@ -102,14 +104,24 @@ class Verification:
     def _draw(self, base: Path, place: Path, progress: Progress) -> tuple[SessionCheck, ...]:
         """Draw into a folder, which will lie at a place."""
         drawn = []
+        board = self.session.rig.board.to_board()
         for check in self.checks:
-            pair, seen = check.pair, self.detections.between(check.pair)
+            pair = check.pair
+            seen = self.detections.between(pair, board)
             name = "" if len(self.checks) == 1 else pair.folder_name
             shown, image_of = check, partial(_image, self.session, pair.camera, pair.channel)
             if check.calibration.is_of_lidars:
                 shown, T_view = seen_through_window(check)
                 image_of = partial(_image, self.session, pair.camera, "", T_view=T_view)
-            draw_check(self.session, seen, shown, base / name, image_of=image_of, progress=progress)
+            draw_check(
+                self.session,
+                seen,
+                shown,
+                base / name,
+                image_of=image_of,
+                scan_of=partial(_scan, self.session, pair),
+                progress=progress,
+            )
             drawn.append(replace(check, page=place / name / PAGE))
         return tuple(drawn)
 
@@ -145,21 +157,23 @@ def verify(
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
     detections = detections or detect(session, progress=progress)
-    checks, pairs = [], [*detections.pairs, *detections.lidar_pairs(session.rig.lidars)]
+    checks, board = [], session.rig.board.to_board()
     for c in calibrations:
-        scene = SceneOpinion(0, 0) if c.is_of_lidars else hear_scene(session, detections, c)
+        scene = SceneOpinion(0, 0) if c.is_of_peers else hear_scene(session, detections, c)
         for channel in sorted(c.channels) or [""]:
-            pair = Pair(c.camera, channel, c.lidar)
-            if pair in pairs:
-                seen = detections.between(pair)
+            pair = replace(Pair.of(c), channel=channel)
+            if c.is_of_peers or pair in detections.pairs:
+                seen = detections.between(pair, board)
+                if not seen.captures(pair):
+                    continue
                 check = check_session(session.rig, seen, c, channel, scene)
-                if not c.captures_used:  # A result of this session has been judged by these boards.
+                if not c.captures_used and not c.is_of_cameras:  # A result of this session has been judged by these boards.
                     # The six axes together: residuals hide a rotation that a translation undoes.
                     key = (pair.camera, pair.channel)
                     alone = Detections({key: seen.images[key]}, {pair.lidar: seen.lidars[pair.lidar]})
-                    board = watch_boards(session.rig, c, channel, alone)
-                    if board is not None and board.joint.is_changed:
-                        check = replace(check, findings=(board.joint.finding, *check.findings))
+                    watched = watch_boards(session.rig, c, channel, alone)
+                    if watched is not None and watched.joint.is_changed:
+                        check = replace(check, findings=(watched.joint.finding, *check.findings))
                 checks.append(check)
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
@@ -281,6 +295,14 @@ def write_debug_images(
         write_picture(place / f"{name}.png", picture)
         progress(done, len(jobs))
     return base
+
+
+def _scan(session: Session, pair: Pair, capture: Capture) -> Scan:
+    """Return a LiDAR's cloud; of two cameras one without points: the second one's corners are drawn."""
+    if not pair.lidar_channel:
+        return session.scan(capture, pair.lidar)
+    none = np.zeros(0)
+    return Scan(pair.lidar, None, np.zeros((0, 3), np.float32), none.astype(np.float32), none.astype(np.int16))
 
 
 def _image(

@@ -86,7 +86,7 @@ class SceneCaptures:
         if result.rig != rig.name or not result.pairs:
             what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
             raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
-        of_cameras = tuple(c for c in result.pairs if not c.is_of_lidars)
+        of_cameras = tuple(c for c in result.pairs if not c.is_of_peers)
         if not of_cameras:
             raise SessionError(
                 "the result is of LiDARs alone",

@@ -260,7 +260,7 @@ class Rig(Settings):
             LiDAR's.
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
         exports: formats that `calibrate` and `export` write; empty for the usual ones.
-        lidars: settings by the LiDAR's name.
+        lidars: settings by the LiDAR's name; none where cameras are calibrated with each other alone.
         cameras: settings by the camera's name; none where LiDARs are calibrated with each other alone.
         nominal_extrinsics: the CAD model's values, a sanity check only.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
@@ -276,7 +276,9 @@ class Rig(Settings):
     mount: Mount | None = None
     exports: OutputFormats = ()
     board: BoardSettings
-    lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
+    lidars: Annotated[dict[Name, LidarSettings], Field(max_length=_MOST_SENSORS)] = Field(
+        default_factory=dict
+    )
     cameras: Annotated[dict[Name, CameraSettings], Field(max_length=_MOST_SENSORS)] = Field(
         default_factory=dict
     )
@@ -288,6 +290,10 @@ class Rig(Settings):
     def corrected(self, scan: Scan) -> Scan:
         """Subtract the LiDAR's constant range offset from a scan; a corrected one is returned unchanged."""
         return scan.corrected(self.lidars[scan.sensor].range_offset_m)
+
+    def frame_of(self, sensor: str) -> str:
+        """Return the frame of a LiDAR, or of a camera's body."""
+        return (self.lidars.get(sensor) or self.cameras[sensor]).frame
 
     def lens_of(self, extrinsics: Calibration) -> Intrinsics:
         """Return the intrinsics that belong to extrinsics: their own, else the profile's."""
@@ -346,25 +352,27 @@ class Rig(Settings):
 
     @property
     def root_frame(self) -> str:
-        """The frame of a sensor from which the others hang: `mount.of`, `base_frame` or the first LiDAR's."""
-        first = next(iter(self.lidars.values())).frame
-        return self.mount.of if self.mount is not None else self.base_frame or first
+        """The frame of a sensor from which the others hang: `mount.of`, `base_frame` or the first sensor's."""
+        first = next(iter([*self.lidars, *self.cameras]))
+        return self.mount.of if self.mount is not None else self.base_frame or self.frame_of(first)
 
     @model_validator(mode="after")
     def _sensors_are_known(self) -> "Rig":
         for name in self.cameras:
             require(name not in self.lidars, f"{name} is the name of a LiDAR already", f"cameras.{name}")
-        is_whole = bool(self.cameras) or len(self.lidars) >= 2
-        require(is_whole, "a rig has a camera, or two LiDARs", "cameras")
+        is_whole = bool(self.lidars) and len(self.cameras) + len(self.lidars) >= 2 or len(self.cameras) >= 2
+        require(is_whole, "a rig has a camera and a LiDAR, two LiDARs or two cameras", "cameras")
         if self.cameras and self.board.type == "plain":
             what = f"a plain plate has no pattern for {next(iter(self.cameras))}"
             raise problem(f"{what}; name the print of your board, or remove the cameras", "board.type")
         used: set[tuple[str, str]] = set()
         for index, entry in enumerate(self.nominal_extrinsics):
             of_lidars = [name for name in self.lidars if name != entry.lidar]
+            of_cameras = [name for name in self.cameras if name != entry.camera]
+            seconds = list(self.lidars) if self.lidars else of_cameras
             for kind, name, names_of_rig in (
                 ("camera", entry.camera, [*self.cameras, *of_lidars]),
-                ("lidar", entry.lidar, list(self.lidars)),
+                ("lidar" if self.lidars else "camera", entry.lidar, seconds),
             ):
                 what = f"no {kind} is called {name}; there is {', '.join(names_of_rig)}"
                 require(name in names_of_rig, what, f"nominal_extrinsics.{index}.{kind}")

@@ -39,8 +39,8 @@ class Table(NamedTuple):
 
 def result_tables(c: Calibration) -> dict[str, Table]:
     """List all tables of a result, in the order in which they are read."""
-    first = c.camera if c.is_of_lidars else "the camera"
-    pose = f"Pose of {c.lidar} on {c.camera}" if c.is_of_lidars else "Pose of the camera on the LiDAR"
+    first = c.camera if c.is_of_peers else "the camera"
+    pose = f"Pose of {c.lidar} on {c.camera}" if c.is_of_peers else "Pose of the camera on the LiDAR"
     points = [
         (
             f"{p.distance_m:g} m",
@@ -85,14 +85,17 @@ def rig_table(poses: RigPoses, cameras: Collection[str]) -> Table:
 
 
 def _pose_rows(c: Calibration) -> list[Row]:
-    """State the pose of the camera's body in the LiDAR's frame, or of two LiDARs the second's in the first's.
+    """State the pose of the camera's body in the LiDAR's frame, or of two of a kind the second's in the first's.
 
     Standard deviations belong to it.
     """
 
     def pose(tangent: Array) -> Array:
         T = perturb(c.T_cam_lidar, tangent)
-        T = T if c.is_of_lidars else invert(T) @ invert(T_BODY_OPTICAL)
+        if c.is_of_cameras:
+            T = T_BODY_OPTICAL @ T @ invert(T_BODY_OPTICAL)
+        elif not c.is_of_lidars:
+            T = invert(T) @ invert(T_BODY_OPTICAL)
         return np.concatenate([T[:3, 3], rpy(T[:3, :3])])
 
     moved = np.array([pose(step) - pose(-step) for step in _STEP * np.eye(6)]).T
@@ -127,13 +130,14 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
 
 def _fit_rows(c: Calibration) -> list[Row]:
     """State residuals and certificate."""
-    first = c.camera if c.is_of_lidars else "the camera"
+    first = c.camera if c.is_of_peers else "the camera"
+    points = f"corners by {c.lidar}" if c.is_of_cameras else "LiDAR points"
     start = "start of the estimate (Algorithm 1)" if c.is_start_certified else "result"
     proof = f"{'proven' if c.certificate.is_optimal else 'not proven'}, gap {c.certificate.gap:.0e}"
     rows = [
         ("captures in which both sensors found the board", f"{c.n_detected} of {c.n_captures}"),
-        (f"LiDAR points from the board planes of {first}, mean", f"{1000 * c.metrics.mpe_m:.1f} mm"),
-        ("ring ends from the board's edges, mean", f"{1000 * c.metrics.mee_m:.1f} mm"),
+        (f"{points} from the board planes of {first}, mean", f"{1000 * c.metrics.mpe_m:.1f} mm"),
+        ("ring ends from the board's edges, mean", _if_known(1000 * c.metrics.mee_m, ".1f", "mm")),
         ("held-out captures, mean of their rms", _if_known(1000 * c.diagnostics.held_out_m, ".1f", "mm")),
         (
             "corners from the board's best pose in each image, rms",

@@ -63,7 +63,7 @@ def squares(factor):
 def explained(observations, method="ml"):
     estimate = fit_extrinsic(observations, BOARD, replace(SETTINGS, method=method))
     joint, camera = estimate.joint
-    return list(explain(at_full_weight(joint, observations, estimate.lens, camera), ALL))
+    return list(explain(at_full_weight(joint, observations, [estimate.lens], camera), ALL))
 
 
 def causes(observations, method="ml"):
@@ -145,7 +145,7 @@ def test_table_chances_of_sound_captures_are_uniform():
     for seed in range(30):
         observations = observed(14, 100 + seed)
         estimate = fit_extrinsic(observations, BOARD, SETTINGS)
-        rows = Table(at_full_weight(estimate.joint[0], observations, None), frozenset(ALL)).rows()
+        rows = Table(at_full_weight(estimate.joint[0], observations, [None]), frozenset(ALL)).rows()
         chances += [
             row.log10_chance for row in rows if row.cause in ("squares", "pattern", "range_offset", "bow")
         ]

@@ -24,7 +24,7 @@ from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.results import LidarBoard, Observation, PatternBoard
 
 # Maximum number of steps between fits of the levels, and of the last steps.
 STEPS, _LAST_STEPS = 3, 20
@@ -184,6 +184,8 @@ def maximise_likelihood(
 ) -> JointEstimate:
     """Estimate extrinsics of C cameras; captures with the same name share scan and board pose.
 
+    Another camera in the LiDAR's place (`PatternBoard`) is the last one, and the base.
+
     Args:
         cameras: observations of each.
         board: the board.
@@ -191,9 +193,10 @@ def maximise_likelihood(
         priors: of the constant errors.
         usual: typical noise levels.
         pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
-        lenses: of each camera, with errors as unknowns; None for exact lenses.
+        lenses: of each camera, with errors as unknowns, the base last; None for exact lenses.
     """
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
+    base = None if len(images) == len(cameras) else len(cameras)
     by_name = {
         o.capture: invert(T) @ o.image.T_cam_board
         for camera, T in zip(cameras, T_cam_lidar, strict=True)
@@ -201,7 +204,8 @@ def maximise_likelihood(
     }
     T_lidar_board = np.array([by_name[name] for name in names])
     n_optics = [each.turns.shape[1] for each in images]
-    state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings), n_optics)
+    T_cameras = np.array([*T_cam_lidar, *([] if base is None else [np.eye(4)])])
+    state = State.without_errors(T_cameras, T_lidar_board, len(scans.rings), n_optics, base)
     placement = group_poses(T_lidar_board)
     terms = linearise(scans, images, board, state, weigh_placements(placement, images))
     return _maximise(terms, priors or Priors(), usual or Levels(), placement, names)
@@ -217,14 +221,16 @@ def stack_captures(
     lidars = {o.capture: o.lidar for camera in cameras for o in camera}
     order = {name: k for k, name in enumerate(sorted(lidars))}
     scans = stack_scans([interior(lidars[name], board) for name in order], board)
+    seen = [{o.capture: o.image for o in camera} for camera in cameras]
+    by_base = {name: b.image for name, b in lidars.items() if isinstance(b, PatternBoard) and b.image}
     images = [
         stack_images(
-            np.array([order[o.capture] for o in camera]),
-            [o.image for o in camera],
+            np.array([order[name] for name in of_camera]),
+            list(of_camera.values()),
             board.pattern_offset_m,
             lens,
         )
-        for camera, lens in zip(cameras, lenses, strict=True)
+        for of_camera, lens in zip([*seen, *([by_base] if by_base else [])], lenses, strict=True)
     ]
     if pose_ratios is not None:
         images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]
@@ -466,8 +472,10 @@ def extrinsics_by_unknowns(terms: Terms) -> Array:
     J = np.zeros((layout.n_cameras, 6, layout.z.size))
     for c, (T_cam_lidar, images) in enumerate(zip(state.T_cam_lidar, terms.images, strict=True)):
         J[c][:, layout.camera(c)] = np.eye(6)
+        J[c, 3:, layout.optics(c)] = images.turns.T
+        if layout.base is not None:
+            continue
         # The third row of R is the camera's line of sight in frame lidar.
         beside = lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
         J[c, :3, layout.z["lens"].start] = T_cam_lidar[:3, :3] @ beside
-        J[c, 3:, layout.optics(c)] = images.turns.T
     return J

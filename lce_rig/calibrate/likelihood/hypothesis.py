@@ -42,7 +42,8 @@ class Hypothesis:
     """F captures of one camera under M mountings, settled.
 
     Attributes:
-        terms: linearised at the optimum; the images of each mounting are those of a camera.
+        terms: linearised at the optimum; the images of each mounting are those of a camera. Those of a camera
+            that is the base are the last.
         images: of all mountings.
         levels: of the noise.
         priors: of the constants.
@@ -110,10 +111,16 @@ class Hypothesis:
         else:
             shown = mounting[self.images.capture]
             split = [self.images.select(shown == m) for m in range(len(T_cam_lidar))]
-            n_optics = self.images.turns.shape[1]
-            layout = Layout([n_optics], old.layout.n_rings, [0] * len(split))
+            of_base = [] if old.layout.base is None else [terms.images[old.layout.base]]
+            lens_of = [0] * len(split) + [1] * len(of_base)
+            n_optics = [each.turns.shape[1] for each in (self.images, *of_base)]
+            base = len(split) if of_base else None
+            layout = Layout(n_optics, old.layout.n_rings, lens_of, base)
             z = old.common_to(layout, terms.scans.rings, terms.scans.rings)
-            z[layout.optics(0)] = old.z[old.layout.optics(0)]
+            for new, before in ((0, 0), (-1, old.layout.n_cameras - 1)):
+                z[layout.optics(new)] = old.z[old.layout.optics(before)]
+            T_cam_lidar = np.array([*T_cam_lidar, *([np.eye(4)] if of_base else [])])
+            split += of_base
             # A wrong mounting has displaced boards from their positions in the scans.
             is_new = ((mounting != self.mounting) & self.is_further)[:, None, None]
             T_lidar_board = np.where(is_new, self.T_lidar_board, old.T_lidar_board)
@@ -125,35 +132,40 @@ class Hypothesis:
 
 
 def at_full_weight(
-    joint: JointEstimate, observations: Sequence[Observation], lens: SessionLens | None, camera: int = 0
+    joint: JointEstimate,
+    observations: Sequence[Observation],
+    lenses: Sequence[SessionLens | None],
+    camera: int = 0,
 ) -> Hypothesis:
     """State the assumptions of an estimate for the captures of one camera.
 
     Args:
         joint: the estimate.
         observations: of the camera, also of captures that the estimate does not use.
-        lens: of the camera; None if it is exact.
+        lenses: of the camera, and of one that is the base; None if exact.
         camera: its number.
     """
     board, T_cam_lidar = joint.terms.board, joint.state.T_cam_lidar[camera]
-    names, scans, (images,) = stack_captures([observations], board, [lens], None)
+    names, scans, images = stack_captures([observations], board, lenses, None)
+    base = None if len(images) == 1 else 1
+    T_cameras = np.stack([T_cam_lidar, *([] if base is None else [np.eye(4)])])
     starts = {o.capture: (_nearest_turn(o, T_cam_lidar), 0.0) for o in observations}
     settled = zip(joint.state.T_lidar_board, joint.state.own_shift_m.tolist(), strict=True)
     starts |= dict(zip(joint.captures, settled, strict=True))
     T_lidar_board = np.array([starts[name][0] for name in names])
     own_shift_m = np.array([starts[name][1] for name in names])
-    layout = Layout([images.turns.shape[1]], len(scans.rings))
+    layout = Layout([each.turns.shape[1] for each in images], len(scans.rings), base=base)
     z = joint.state.common_to(layout, joint.terms.scans.rings, scans.rings)
-    state = State(layout, T_cam_lidar[None], T_lidar_board, own_shift_m, z)
-    trust = weigh_placements(group_poses(T_lidar_board), [images])
-    terms = linearise(scans, [images], board, state, trust)
+    state = State(layout, T_cameras, T_lidar_board, own_shift_m, z)
+    trust = weigh_placements(group_poses(T_lidar_board), images)
+    terms = linearise(scans, images, board, state, trust)
     levels, priors = joint.levels.with_usual_images, replace(joint.priors, freedoms=np.inf)
     for _ in range(_OWN_STEPS):
         own = -assemble(terms, levels, priors).own_steps[:, :, -1]
-        terms = linearise(scans, [images], board, terms.state.moved(np.zeros(layout.z.size), own), trust)
+        terms = linearise(scans, images, board, terms.state.moved(np.zeros(layout.z.size), own), trust)
     alike = np.zeros(len(names), dtype=np.intp)
     is_further = np.array([name not in joint.captures for name in names])
-    return Hypothesis(terms, images, levels, priors, names, alike, T_lidar_board, is_further).under()
+    return Hypothesis(terms, images[0], levels, priors, names, alike, T_lidar_board, is_further).under()
 
 
 def _nearest_turn(observation: Observation, T_cam_lidar: Array) -> Array:

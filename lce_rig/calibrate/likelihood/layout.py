@@ -89,14 +89,22 @@ class Layout:
         n_optics: number of unknowns of each lens.
         n_rings: L.
         lens_of: number of the lens of each camera, its own by default. A camera that moved counts as two.
+        base: the camera in whose frame the boards' poses are, where there is no LiDAR.
 
     Attributes:
         z: places in the vector of the unknowns that captures share.
         row: places in a row [y, z, residual].
     """
 
-    def __init__(self, n_optics: Sequence[int], n_rings: int, lens_of: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        n_optics: Sequence[int],
+        n_rings: int,
+        lens_of: Sequence[int] | None = None,
+        base: int | None = None,
+    ) -> None:
         self._lens_of = range(len(n_optics)) if lens_of is None else lens_of
+        self.base = base
         self.n_cameras, self.n_rings = len(self._lens_of), n_rings
         common = {f"camera {c}": 6 for c in range(self.n_cameras)}
         common |= {**dict.fromkeys(LASER, n_rings), **_FIELDS, "shifts": len(SHIFTS)}
@@ -168,10 +176,15 @@ class State:
 
     @classmethod
     def without_errors(
-        cls, T_cam_lidar: Array, T_lidar_board: Array, n_rings: int, n_optics: Sequence[int]
+        cls,
+        T_cam_lidar: Array,
+        T_lidar_board: Array,
+        n_rings: int,
+        n_optics: Sequence[int],
+        base: int | None = None,
     ) -> "State":
-        """Start with constant errors of zero; `n_optics` as of `Layout`."""
-        layout = Layout(n_optics, n_rings)
+        """Start with constant errors of zero; `n_optics` and `base` as of `Layout`."""
+        layout = Layout(n_optics, n_rings, base=base)
         return cls(layout, T_cam_lidar, T_lidar_board, np.zeros(len(T_lidar_board)), np.zeros(layout.z.size))
 
     @property

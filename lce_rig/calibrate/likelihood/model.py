@@ -32,6 +32,8 @@ _LOG_STEP = 1e-4
 # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
 # extrinsics. This much of it is left.
 _MEAN_FLOOR = 1e-6
+# Standard deviation of the pose of a camera that is the base, m and rad.
+_BASE_SIGMA = 1e-6
 _OF_PROFILE = frozenset(BOARD)
 
 
@@ -383,6 +385,9 @@ def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
     for name, sigma in sigmas.items():
         at = layout.z.of([name])
         prior[at, at] = sigma**-2.0
+    if layout.base is not None:
+        at = layout.camera(layout.base)
+        prior[at, at] = _BASE_SIGMA**-2.0
     for at in (layout.z.of(sigmas.keys() & _OF_PROFILE), layout.plate):
         # Weights of Student's distribution at the present values.
         prior[at, at] /= 1 + prior[at, at] * terms.state.z[at] ** 2 / priors.freedoms

@@ -71,9 +71,10 @@ from lce_rig.calibrate.plane_and_ends import (
     turn_about_z,
 )
 from lce_rig.core.board import Board
+from lce_rig.core.data import NO_RING
 from lce_rig.core.geometry import Array
 from lce_rig.core.pattern import is_dark
-from lce_rig.core.results import LidarBoard
+from lce_rig.core.results import LidarBoard, PatternBoard
 
 # Typical noise of a cell's mean without rings.
 _MEAN_M = 0.008
@@ -132,7 +133,12 @@ class StackedScans:
 
 
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
-    """Remove returns near the border, where the beam also hits the background and reads too long."""
+    """Remove returns near the border, where the beam also hits the background and reads too long.
+
+    Corners that another camera sees are no returns: `images` weighs them.
+    """
+    if isinstance(lidar, PatternBoard):
+        return replace(lidar, points=lidar.points[:0], ring=lidar.ring[:0])
     T = lidar.T_lidar_board
     xy = ((np.asarray(lidar.points, dtype=np.float64) - T[:3, 3]) @ T[:3, :3])[:, :2]
     keep = np.all(np.abs(xy) < np.array([board.width_m, board.height_m]) / 2 - _BORDER_M, axis=1)
@@ -145,6 +151,8 @@ def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
 def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     """Stack the boards of F captures; `board` is their size."""
     rings = np.unique(np.concatenate([numbers for b in boards for numbers in (b.ring, b.edge_ring)]))
+    # Where no LiDAR saw the boards, one ring stands for its errors, which nothing measures.
+    rings = rings if len(rings) else np.array([NO_RING], dtype=np.int16)
     capture = np.repeat(np.arange(len(boards)), [len(board.points) for board in boards])
     ring = np.searchsorted(rings, np.concatenate([board.ring for board in boards]))
     points = np.concatenate([np.asarray(board.points, dtype=np.float64) for board in boards])
@@ -270,7 +278,8 @@ def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     sums = np.zeros((by_ring[0] * by_ring[1], RING.size, RING.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
     # A product of matrices for each ring: several times faster than sums of products of columns.
-    sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
+    if len(v):
+        sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
     n_returns = np.bincount(scans.group, minlength=len(sums)).astype(np.float64)
     return RangeSums(sums.reshape(*by_ring, RING.size, RING.size), n_returns.reshape(by_ring))
 

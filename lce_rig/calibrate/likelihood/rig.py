@@ -289,7 +289,7 @@ def maximise_rig(
     terms = settle(terms, 0.0, _STEPS, NEAR)
     estimate = RigEstimate(terms, tuple(levels), tuple(priors), placement)
     J = np.concatenate(
-        [estimate.camera(c)[1] for c in range(len(images))]
+        [estimate.camera(c)[1] for c in range(len(images)) if c != states[0].layout.base]
         + [estimate.lidar(m)[1] for m in range(1, len(scans))]
     )
     trust = once * by_influence(estimate.cost, J)

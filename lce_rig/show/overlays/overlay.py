@@ -190,6 +190,7 @@ def draw_check(
     folder: Path,
     *,
     image_of: Callable[[Capture], Image | None],
+    scan_of: Callable[[Capture], Scan],
     progress: Callable[[int, int], None],
 ) -> None:
     """Project the point cloud of every capture into its image, and write a page that shows them all.
@@ -200,6 +201,7 @@ def draw_check(
         check: of one channel on these captures.
         folder: receives `<capture>.png` and the page.
         image_of: returns the channel's image in a capture; None if it cannot be read.
+        scan_of: returns the cloud to draw in a capture.
         progress: called with (done, total).
 
     Raises:
@@ -209,7 +211,7 @@ def draw_check(
     scans = []
     for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
         with suppress(SessionError):
-            scans.append(session.scan(session.capture(name), check.pair.lidar))
+            scans.append(scan_of(session.capture(name)))
     limits_m = range_limits(scans)
     shown = []
     for done, name in enumerate(names, start=1):
@@ -218,7 +220,7 @@ def draw_check(
         if image is not None:
             # A capture whose scan cannot be read is not drawn.
             with suppress(SessionError):
-                scan, board = session.scan(capture, check.pair.lidar), detections.of(check.pair, name)[0]
+                scan, board = scan_of(capture), detections.of(check.pair, name)[0]
                 picture = _draw(name, image, scan, session, check, board, limits_m)
                 canvas.write_picture(folder / f"{name}.png", picture)
                 shown.append((name, "; ".join(_figures(name, check)), _cause(name, c)))

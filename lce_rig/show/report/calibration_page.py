@@ -92,7 +92,7 @@ def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) 
 
 def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
     """List the content of one camera and one LiDAR's part of the page, by the template's names."""
-    board, lens = rig.board.to_board(), None if c.is_of_lidars else rig.lens_of(c)
+    board, lens = rig.board.to_board(), None if c.is_of_peers else rig.lens_of(c)
     evidence = None if lens is None else gather(c, board, lens)
     tables = result_tables(c)
     captures = [
@@ -108,10 +108,7 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
         "anchor": anchor,
         "statement": _statement(c),
         "reasons": _reasons(c),
-        "body_frames": (
-            rig.lidars[c.lidar].frame,
-            (rig.lidars if lens is None else rig.cameras)[c.camera].frame,
-        ),
+        "body_frames": (rig.frame_of(c.lidar), rig.frame_of(c.camera)),
         "tables": tables,
         "captures": captures,
         "lens": [finding.text for finding in c.findings if finding.code in _LENS_CODES],
@@ -163,7 +160,7 @@ def _drawings(
 
 def _statement(c: Calibration) -> str:
     """Sum a result up in one paragraph that anyone can sign, with its figures."""
-    sensor = c.camera if c.is_of_lidars else f"camera {c.camera}"
+    sensor = c.camera if c.is_of_peers else f"camera {c.camera}"
     known = (
         f"The pose of {sensor} relative to {c.lidar} has a standard deviation of "
         f"{significant(c.sigma_rotation_deg)} deg and {significant(1000 * c.sigma_translation_m)} mm, from "
