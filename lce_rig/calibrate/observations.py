@@ -35,7 +35,12 @@ class Clocks:
 
     @classmethod
     def of(cls, rig: Rig, camera: str, lidar: str) -> "Clocks":
-        """Read the settings of a camera and a LiDAR; the first of two LiDARs has no channels."""
+        """Read the settings of a camera and a LiDAR; the first of two LiDARs has no channels.
+
+        Boards before two cameras stand still.
+        """
+        if lidar in rig.cameras:
+            return cls()
         channels = rig.cameras[camera].channels if camera in rig.cameras else {}
         stamps = {name: channel.timestamps for name, channel in channels.items()}
         return cls(

@@ -30,6 +30,8 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation, PatternBoard
 
+# Errors of the profile that displace two cameras against each other.
+_OF_CAMERAS = ("square_size", "intrinsics")
 SensorPair = tuple[str, str]
 """Names of a camera and a LiDAR, or of two LiDARs."""
 
@@ -257,13 +259,14 @@ def _report(
     shift = at[part.state.layout.z["shifts"]][0]
     shift_sigma_m = float(np.sqrt(joint.cov_z[shift, shift]))
     figures = with_errors(start.diagnostics, joint.levels[m], part.state, shift_sigma_m, inflation)
-    if is_of_cameras:
-        figures = without_lidar(figures)
     if result.cameras:
         figures = replace(figures, camera_scale=1.0 - joint.terms.base.state.squares)
-    estimate = report(start, T, cov, board, with_parts(figures, scatter, constants))
+    figures = with_parts(figures, scatter, constants)
     moves = tuple(Sensitivity(name, 1.0, (J @ each).T) for name, each in joint.moves.items())
-    return replace(estimate, method="ml", sensitivities=moves)
+    if is_of_cameras:
+        figures = without_lidar(figures)
+        moves = tuple(each for each in moves if each.source in _OF_CAMERAS)
+    return replace(report(start, T, cov, board, figures), method="ml", sensitivities=moves)
 
 
 class _Known(NamedTuple):

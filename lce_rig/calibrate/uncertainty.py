@@ -254,8 +254,8 @@ def with_errors(
 
 
 def without_lidar(figures: Diagnostics) -> Diagnostics:
-    """Remove the figures of a LiDAR and its ring ends."""
-    names = ("edge_shift", "range_offset", "laser_spread", "lens_vertical", "noise_range")
+    """Remove the figures of a LiDAR, its errors and its ring ends."""
+    names = ("edge_shift", "range_offset", "laser_spread", "lens_vertical", "noise_range", "sigma_systematic")
     unknown = {name: math.nan for name in figures.figures() if name.startswith(names)}
     return replace(figures, **unknown)
 

@@ -259,7 +259,7 @@ def _lacking(
         cameras: of which the session holds captures.
         calibrations: the results, at least one.
     """
-    calibrated = {calibration.camera for calibration in calibrations}
+    calibrated = {name for c in calibrations for name in (c.camera, c.lidar)}
     missing = [camera for camera in wanted if camera not in calibrated]
     if not missing:
         return None

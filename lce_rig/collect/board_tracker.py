@@ -57,10 +57,12 @@ class BoardDetection:
 
     @property
     def is_usable(self) -> bool:
-        """Whether a camera and a LiDAR, or of a rig without cameras two LiDARs, see a board within limits."""
+        """Whether a camera and a LiDAR, or two sensors of a rig of one kind, see a board within limits."""
         if not self.images:
             return len(self.lidars) > 1
-        return bool(self.images.keys() - self.unfit.keys() and self.lidars)
+        cameras = {camera for camera, _ in self.images.keys() - self.unfit.keys()}
+        is_of_one_kind = not self.frame.scans and not self.lidars
+        return len(cameras) > 1 if is_of_one_kind else bool(cameras and self.lidars)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +188,9 @@ class BoardTracker:
         scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
-        n_lidars = 1 if self.rig.cameras else 2
-        for found, refused, n_needed in ((usable, images, min(len(images), 1)), (lidars, scans, n_lidars)):
+        n_lidars = 0 if not self.rig.lidars else 1 if self.rig.cameras else 2
+        n_images = min(len(images), 1 if self.rig.lidars else 2)
+        for found, refused, n_needed in ((usable, images, n_images), (lidars, scans, n_lidars)):
             if len(found) < n_needed:
                 return next(why for why in refused.values() if isinstance(why, Refusal))
         elsewhere = self._find_elsewhere(usable, lidars)

@@ -17,9 +17,9 @@ GUIDE_NO_NOMINAL = Kind(
     "the profile has no nominal extrinsics of {camera} and {lidar}",
     severity="warning",
 )
-GUIDE_WITHOUT_CAMERA = Kind(
-    "guide.without_camera",
-    "no guidance without a camera: {n_captures} placements that differ in distance, side and tilt are enough",
+GUIDE_OF_PEERS = Kind(
+    "guide.of_peers",
+    "no guidance for two sensors of one kind: {n_captures} placements at all distances, sides and tilts do",
     severity="note",
 )
 GUIDE_CONTINUES = Kind(

@@ -164,7 +164,9 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
         for lidar, candidates in middle.lidars.items()
     ]
     # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
-    return max(max(motions), min(lidar_motions)) if motions else max(lidar_motions)
+    if not motions or not lidar_motions:
+        return max([*motions, *lidar_motions])
+    return max(max(motions), min(lidar_motions))
 
 
 def _square_px(corners_px: Array, board: Board) -> float:

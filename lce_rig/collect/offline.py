@@ -169,7 +169,7 @@ class _Collector:
             SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
                 came before has been captured.
         """
-        require_sensors(recording, has_cameras=bool(self._session.rig.cameras))
+        require_sensors(recording, self._session.rig)
         known = Placements()
         # Where a capture of this recording was rejected, another moment of that placement is not wanted.
         unwanted = {name for key, name in self._names_by_key.items() if key.startswith(f"{recording.key}:")}

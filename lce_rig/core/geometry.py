@@ -167,6 +167,8 @@ def sigma_sizes(cov: Array) -> tuple[float, float]:
         cov: (6 + k, 6 + k), the tangent first.
     """
     rotation, translation = np.trace(cov[3:6, 3:6]), np.trace(cov[:3, :3])
+    # Rounding may leave variances of nothing below zero.
+    rotation, translation = max(rotation, 0.0), max(translation, 0.0)
     return float(np.degrees(np.sqrt(rotation))), float(np.sqrt(translation))
 
 

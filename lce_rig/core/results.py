@@ -260,7 +260,6 @@ class PatternBoard(LidarBoard):
             image=image,
         )
 
-
     @classmethod
     def candidates(cls, image: ImageBoard, corners: Array) -> list[LidarBoard]:
         """List the poses that an image leaves open; arguments as of `of`."""

@@ -15,7 +15,14 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality, PatternBoard
+from lce_rig.core.results import (
+    EventQuality,
+    ImageBoard,
+    ImageQuality,
+    LidarBoard,
+    LidarQuality,
+    PatternBoard,
+)
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal

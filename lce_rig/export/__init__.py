@@ -106,7 +106,7 @@ class ExportJob:
                 reasons = "; ".join(finding.sentence for finding in calibration.findings)
                 reasons = " ".join(reasons.split()) or "no reason given"
                 lines.append(f"NOT FOR USE: the calibration of {pair} failed: {reasons}")
-        present = {calibration.camera for calibration in calibrations}
+        present = {name for calibration in calibrations for name in (calibration.camera, calibration.lidar)}
         absent = [camera for camera in self.rig.cameras if camera not in present]
         if absent and not of_one_camera:
             lines.append(f"not in this file, without a usable result: {', '.join(absent)}")

@@ -406,8 +406,17 @@ class FolderRecording:
         self.notes: list[str] = []
         self._rig = rig
         images = _images(path, rig, options, self.notes) if rig.cameras else []
-        clouds, *lidars = _clouds(path, rig, options, self.notes)
-        others = images + lidars
+        if rig.lidars:
+            clouds, *lidars = _clouds(path, rig, options, self.notes)
+            others = images + lidars
+        elif len(images) < 2:
+            names = ", ".join(f"{name}/" for name in rig.cameras)
+            raise SourceError(
+                f"{path}: images of fewer than two cameras found",
+                f"Put each camera's into a folder of its name: {names}; equal file names match.",
+            )
+        else:
+            clouds, *others = images
         # The second image of one camera that goes with a point cloud makes a pair of its own.
         together: dict[tuple[int, int], list[FileOnDisk]] = {}
         lone: list[str] = []
@@ -441,7 +450,8 @@ class FolderRecording:
             n_clouds = len(clouds) - len({j for _, j in pairs})
             if n_files or n_clouds:
                 what = "images" if files[0].channel else "of its"
-                note += f"; {n_files} {what} and {n_clouds} point clouds have no partner"
+                whole = f"images of {clouds[0].sensor}" if clouds[0].channel else "point clouds"
+                note += f"; {n_files} {what} and {n_clouds} {whole} have no partner"
             self.notes.append(note)
         return [pairs for pairs, _ in pairings]
 
@@ -449,10 +459,13 @@ class FolderRecording:
         self, files: Sequence[FileOnDisk], clouds: Sequence[FileOnDisk], *, may_count: bool = True
     ) -> tuple[Pairs, str]:
         first, lidar = files[0], clouds[0].sensor
-        if first.channel:
-            tolerance_s = self._rig.cameras[first.sensor].channels[first.channel].timestamps.tolerance_s
-        else:
-            tolerance_s = max(self._rig.lidars[name].timestamps.tolerance_s for name in (first.sensor, lidar))
+        settings = [
+            self._rig.cameras[each.sensor].channels[each.channel]
+            if each.channel
+            else self._rig.lidars[each.sensor]
+            for each in ((first,) if first.channel else (first, clouds[0]))
+        ]
+        tolerance_s = max(each.timestamps.tolerance_s for each in settings)
         stems = [file.path.stem for file in files], [cloud.path.stem for cloud in clouds]
         try:
             return pair_names(*stems, tolerance_s, may_count=may_count)

@@ -322,8 +322,8 @@ def _belongs(recording: Recording, group: Sequence[Recording], later: Sequence[R
     return bool(recording.streams - held) or {"scans"} not in kinds_later
 
 
-def require_sensors(recording: ContinuousRecording, *, has_cameras: bool = True) -> None:
-    """Make sure that a recording holds a LiDAR and a camera, or two LiDARs of a rig without cameras.
+def require_sensors(recording: ContinuousRecording, rig: Rig) -> None:
+    """Make sure that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
 
     Raises:
         SourceError: it does not; the hint names the recording to add.
@@ -331,10 +331,15 @@ def require_sensors(recording: ContinuousRecording, *, has_cameras: bool = True)
     kinds = {stream.kind for stream in recording.streams}
     holds = ", ".join(f"{stream.kind} of {stream}" for stream in sorted(recording.streams))
     example = "recording of the same time: --from lidar.bag --from events.aedat4"
+    if not rig.lidars:
+        if len({stream.sensor for stream in recording.streams}) < 2:
+            what = f"{recording.path}: images of one camera only; it holds {holds}"
+            raise SourceError(what, "Also give the other camera's recording of the same time.")
+        return
     if "scans" not in kinds:
         what = f"{recording.path}: no scans of a LiDAR; it holds {holds}"
         raise SourceError(what, f"Also give the LiDAR's {example}")
-    if not has_cameras:
+    if not rig.cameras:
         if len([stream for stream in recording.streams if stream.kind == "scans"]) < 2:
             what = f"{recording.path}: scans of one LiDAR only; it holds {holds}"
             hint = (

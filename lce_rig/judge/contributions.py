@@ -53,7 +53,9 @@ def list_contributions(
             for each in contradictions
         ),
     ]
-    return tuple(sorted(parts, key=lambda part: -part.sigma_translation_m))
+    # Two cameras have no errors of a LiDAR.
+    known = [part for part in parts if math.isfinite(part.sigma_translation_m)]
+    return tuple(sorted(known, key=lambda part: -part.sigma_translation_m))
 
 
 def largest(causes: Sequence[Contribution], size: str) -> str:

@@ -14,6 +14,7 @@ from lce_rig.calibrate.observations import SharedScan, scan_key
 from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, ChannelResult, Metrics, SceneOpinion
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.planar_pose import solve_planar_pose
@@ -223,19 +224,20 @@ def check_session(
 
 
 def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration) -> Detections:
-    """Solve the boards' poses in images of a result's camera again, with the result's lens and board.
+    """Solve the boards' poses in images of a result's cameras again, with the result's lenses and board.
 
     Poses of moving boards, which come with those of further images, are kept.
     """
-    lens = calibration.intrinsics
-    if lens is None:
-        return detections
+    c, lenses = calibration, {}
+    for name, lens in ((c.camera, c.intrinsics), (c.lidar, c.lidar_intrinsics)):
+        if lens is not None:
+            lenses[name] = lens
     board = rig.board.to_board()
     corners = replace(board, square_m=calibration.square_m or board.square_m).corners()
     if calibration.board_shape is not None:
         corners = corners + np.tensordot(calibration.board_shape, board_shapes(board)[0], axes=1)
 
-    def again(image: ImageDetection) -> ImageDetection:
+    def again(image: ImageDetection, lens: Intrinsics) -> ImageDetection:
         if not isinstance(image, ImageBoard) or image.track_ns is not None:
             return image
         solved = solve_planar_pose(image.corners_px, corners, lens)
@@ -245,8 +247,8 @@ def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration)
         return replace(seen, events=image.events, stamp_ns=image.stamp_ns)
 
     images = {
-        (camera, channel): {name: again(image) for name, image in of_channel.items()}
-        if camera == calibration.camera
+        (camera, channel): {name: again(image, lenses[camera]) for name, image in of_channel.items()}
+        if camera in lenses
         else of_channel
         for (camera, channel), of_channel in detections.images.items()
     }
@@ -294,7 +296,7 @@ def find_meetings(
     observations: dict[str, list[Observation]] = {}
     for name in sorted({pair.channel, *(result.channel for result in results)}):
         of_channel = replace(pair, channel=name)
-        if of_channel not in detections.pairs:
+        if not detections.captures(of_channel):
             continue
         observations[name] = []
         for capture in detections.captures(of_channel):

@@ -1,7 +1,7 @@
 """Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
-detections -> estimate of each camera with each LiDAR, and of every two LiDARs or two cameras (`peer_pairs`) -> all sensors
-that agree, as one (`rig_estimate`) -> checks, verdict -> the scene's opinion
+detections -> estimate of each camera with each LiDAR, and of every two LiDARs or two cameras (`peer_pairs`)
+-> all sensors that agree, as one (`rig_estimate`) -> checks, verdict -> the scene's opinion
 """
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -221,9 +221,7 @@ def _solve(
         given = match_lidars(candidates, boards, board, (first, second))
     of_lidars = [name for name in names if name in rig.lidars]
     estimate = estimate_rig({}, {names: given}, board, of_lidars).estimates[names]
-    return SolvedPeers(
-        pair, len(candidates), lacking, given, estimate, _validate(rig, pair, given, estimate)
-    )
+    return SolvedPeers(pair, len(candidates), lacking, given, estimate, _validate(rig, pair, given, estimate))
 
 
 def _validate(

@@ -17,7 +17,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.board_drift import watch_boards
-from lce_rig.judge.session_check import SessionCheck, check_session
+from lce_rig.judge.session_check import SessionCheck, check_session, seen_by_own_lens
 from lce_rig.pipeline.detect_session import detect, event_channels, event_picture, match_sensors
 from lce_rig.pipeline.findings import OTHER_PROFILE
 from lce_rig.pipeline.result_files import (
@@ -163,11 +163,13 @@ def verify(
         for channel in sorted(c.channels) or [""]:
             pair = replace(Pair.of(c), channel=channel)
             if c.is_of_peers or pair in detections.pairs:
-                seen = detections.between(pair, board)
+                seen = seen_by_own_lens(session.rig, detections, c).between(pair, board)
                 if not seen.captures(pair):
                     continue
                 check = check_session(session.rig, seen, c, channel, scene)
-                if not c.captures_used and not c.is_of_cameras:  # A result of this session has been judged by these boards.
+                if (
+                    not c.captures_used and not c.is_of_cameras
+                ):  # A result of this session has been judged by these boards.
                     # The six axes together: residuals hide a rotation that a translation undoes.
                     key = (pair.camera, pair.channel)
                     alone = Detections({key: seen.images[key]}, {pair.lidar: seen.lidars[pair.lidar]})
@@ -302,7 +304,9 @@ def _scan(session: Session, pair: Pair, capture: Capture) -> Scan:
     if not pair.lidar_channel:
         return session.scan(capture, pair.lidar)
     none = np.zeros(0)
-    return Scan(pair.lidar, None, np.zeros((0, 3), np.float32), none.astype(np.float32), none.astype(np.int16))
+    return Scan(
+        pair.lidar, None, np.zeros((0, 3), np.float32), none.astype(np.float32), none.astype(np.int16)
+    )
 
 
 def _image(

@@ -152,7 +152,7 @@ class SceneCaptures:
         self.notes += [f"skipped: {error.what}" for error in failures]
 
     def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
-        require_sensors(recording)
+        require_sensors(recording, self._rig)
         losses = Losses()
 
         def counted() -> Iterator[Sample]:

@@ -304,6 +304,8 @@ class Rig(Settings):
         """Replace the cameras' intrinsics by those that belong to extrinsics; the first of a camera count."""
         cameras = dict(self.cameras)
         for each in reversed(extrinsics):
+            if each.lidar in cameras and each.lidar_intrinsics is not None:
+                cameras[each.lidar] = self.cameras[each.lidar].with_intrinsics(each.lidar_intrinsics)
             if each.camera in cameras:
                 cameras[each.camera] = self.cameras[each.camera].with_intrinsics(self.lens_of(each))
         return self.model_copy(update={"cameras": cameras})
@@ -352,7 +354,7 @@ class Rig(Settings):
 
     @property
     def root_frame(self) -> str:
-        """The frame of a sensor from which the others hang: `mount.of`, `base_frame` or the first sensor's."""
+        """The frame of a sensor from which others hang: `mount.of`, `base_frame` or the first sensor's."""
         first = next(iter([*self.lidars, *self.cameras]))
         return self.mount.of if self.mount is not None else self.base_frame or self.frame_of(first)
 
@@ -360,7 +362,7 @@ class Rig(Settings):
     def _sensors_are_known(self) -> "Rig":
         for name in self.cameras:
             require(name not in self.lidars, f"{name} is the name of a LiDAR already", f"cameras.{name}")
-        is_whole = bool(self.lidars) and len(self.cameras) + len(self.lidars) >= 2 or len(self.cameras) >= 2
+        is_whole = (bool(self.lidars) and len(self.cameras) + len(self.lidars) >= 2) or len(self.cameras) >= 2
         require(is_whole, "a rig has a camera and a LiDAR, two LiDARs or two cameras", "cameras")
         if self.cameras and self.board.type == "plain":
             what = f"a plain plate has no pattern for {next(iter(self.cameras))}"

@@ -85,7 +85,7 @@ def rig_table(poses: RigPoses, cameras: Collection[str]) -> Table:
 
 
 def _pose_rows(c: Calibration) -> list[Row]:
-    """State the pose of the camera's body in the LiDAR's frame, or of two of a kind the second's in the first's.
+    """State the pose of the camera's body in the LiDAR's frame; of two of a kind, the second's in the first's.
 
     Standard deviations belong to it.
     """
@@ -143,7 +143,7 @@ def _fit_rows(c: Calibration) -> list[Row]:
             "corners from the board's best pose in each image, rms",
             _if_known(c.metrics.reprojection_px, ".2f", "px"),
         ),
-        (f"{start} is the global minimum of its cost", proof),
+        (f"{start} is the global minimum of its cost", "" if c.is_of_cameras else proof),
     ]
     return [row for row in rows if row[1]]
 

@@ -69,6 +69,6 @@ def _no_image(finding: Finding) -> str:
 
 
 READ_NO_IMAGE_AT_SCAN = Kind("read.no_image_at_scan", _no_image)
-READ_NO_OTHER_SCAN = Kind(
-    "read.no_other_scan", "no scan of another LiDAR at that time", "check that their clocks agree"
+READ_NO_OTHER = Kind(
+    "read.no_other", "no sample of another sensor at that time", "check that their clocks agree"
 )

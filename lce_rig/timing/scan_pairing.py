@@ -11,7 +11,7 @@ import numpy as np
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
 from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig
-from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER_SCAN
+from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
@@ -166,9 +166,10 @@ class Frame:
     """The samples of all sensors at one time.
 
     Attributes:
-        time_ns: middle of the first LiDAR's scan, rig time (timestamps plus the profile's expected offsets).
+        time_ns: middle of the first LiDAR's scan, or of a rig without LiDARs the first camera's image; rig
+            time (timestamps plus the profile's expected offsets).
         images: the image of each camera channel that has one within the tolerance.
-        scans: the scan of the first LiDAR, and of each other that has one within the tolerance.
+        scans: the scan of the first LiDAR, if there is one, and of each other with one within the tolerance.
         events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
     """
 
@@ -188,7 +189,8 @@ def pair_by_time(
 ) -> Iterator[Frame]:
     """Return each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
 
-    Of a rig without cameras, return each with the nearest scans of other LiDARs.
+    Of a rig without cameras, return each with the nearest scans of other LiDARs; without LiDARs, each image
+    of the first camera heard with the nearest ones of others.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
     has gone by. Where clocks are set back, what waits is given up.
@@ -208,7 +210,7 @@ def pair_by_time(
 
 
 class _Pairing:
-    """Scans that wait, and what has come of the other sensors."""
+    """Samples of the first sensor that wait, and what has come of the others."""
 
     def __init__(self, rig: Rig, losses: Losses, kept_ns: int, are_events_enough: bool) -> None:
         self._rig = rig
@@ -216,10 +218,11 @@ class _Pairing:
         self._losses = losses
         self._kept_ns = kept_ns
         self._nearest_ns: int | None = None
-        self._waiting: deque[tuple[int, int, Scan]] = deque()
+        self._waiting: deque[tuple[int, int, Image | Scan]] = deque()
         self._buffers: _Buffers = {}
         self._events = EventBuffer(rig)
-        self._anchor: str | None = None
+        self._kind: type[Image | Scan] = Scan if rig.lidars else Image
+        self._anchor: tuple[str, str] | None = None
         # How far images and scans have come, and all of them.
         self._newest_ns = self._position_ns = -(2**62)
 
@@ -240,11 +243,11 @@ class _Pairing:
                 self._events.clear()
                 self._newest_ns = self._position_ns = time_ns
             self._newest_ns = max(self._newest_ns, time_ns)
-            if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
-                self._anchor = sample.sensor
+            key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
+            if isinstance(sample, self._kind) and key == (self._anchor or key):
+                self._anchor = key
                 self._waiting.append((time_ns, half_ns, sample))
             else:
-                key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
                 buffer = self._buffers.setdefault(key, deque())
                 buffer.append((time_ns, sample))
                 # Of a recording whose scans come later, or never.
@@ -269,9 +272,9 @@ class _Pairing:
         while self._waiting:
             yield from self._frame(*self._waiting.popleft())
 
-    def _frame(self, time_ns: int, half_ns: int, scan: Scan) -> Iterator[Frame]:
-        images: list[Image] = []
-        scans = [scan]
+    def _frame(self, time_ns: int, half_ns: int, anchor: Image | Scan) -> Iterator[Frame]:
+        images = [anchor] if isinstance(anchor, Image) else []
+        scans = [anchor] if isinstance(anchor, Scan) else []
         nearest_ns: int | None = None
         for key in sorted(self._buffers):
             buffer = self._buffers[key]
@@ -283,7 +286,7 @@ class _Pairing:
             apart_ns, sample = abs(buffer[0][0] - time_ns), buffer[0][1]
             if isinstance(sample, Image):
                 nearest_ns = apart_ns if nearest_ns is None else min(apart_ns, nearest_ns)
-            if apart_ns > tolerance_ns(sample, scan, self._rig):
+            if apart_ns > tolerance_ns(sample, anchor, self._rig):
                 continue
             if isinstance(sample, Image):
                 images.append(sample)
@@ -292,11 +295,11 @@ class _Pairing:
         events: tuple[EventCut, ...] = ()
         if images or self._are_events_enough:
             events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
-        are_scans_enough = not self._rig.cameras
-        if images or events or (are_scans_enough and len(scans) > 1):
+        is_of_one_kind = not self._rig.cameras or not self._rig.lidars
+        if len(scans) + len(images) > 1 or (events and not is_of_one_kind):
             yield Frame(time_ns, tuple(images), tuple(scans), events)
-        elif are_scans_enough:
-            self._losses.add(READ_NO_OTHER_SCAN.refusal())
+        elif is_of_one_kind:
+            self._losses.add(READ_NO_OTHER.refusal())
         else:
             is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
             nearest_s = None if nearest_ns is None else nearest_ns * 1e-9
@@ -316,11 +319,12 @@ def _half_sweep_ns(scan: Scan, rig: Rig) -> int:
     return int(scan.offset_ns.max()) // 2
 
 
-def tolerance_ns(sample: Image | Scan, scan: Scan, rig: Rig) -> float:
-    """Return how far a sample may lie from a scan, by the wider tolerance of the two streams."""
-    lidar = rig.lidars[scan.sensor].timestamps.tolerance_s
-    if isinstance(sample, Image):
-        other = rig.cameras[sample.sensor].channels[sample.channel].timestamps.tolerance_s
-    else:
-        other = rig.lidars[sample.sensor].timestamps.tolerance_s
-    return max(lidar, other) * 1e9
+def tolerance_ns(one: Image | Scan, other: Image | Scan, rig: Rig) -> float:
+    """Return how far two samples of one moment may lie apart, by the wider tolerance of their streams."""
+    tolerances_s = [
+        rig.cameras[each.sensor].channels[each.channel].timestamps.tolerance_s
+        if isinstance(each, Image)
+        else rig.lidars[each.sensor].timestamps.tolerance_s
+        for each in (one, other)
+    ]
+    return max(tolerances_s) * 1e9

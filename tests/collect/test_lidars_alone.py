@@ -108,7 +108,7 @@ def test_a_plate_that_moves_or_is_not_in_both_scans_is_no_capture(tmp_path: Path
         assert not collect(session, [recorded(moved)]).captured
         apart = recorded([place(2.5, 15, 45, 20)] * 8, late_ns=5_000_000_000)
         report = collect(session, [apart])
-    assert not report.captured and "read.no_other_scan" in report.counts.by_code()
+    assert not report.captured and "read.no_other" in report.counts.by_code()
 
 
 def test_scans_of_one_lidar_are_refused_with_what_to_add(tmp_path: Path, rig: Rig) -> None:

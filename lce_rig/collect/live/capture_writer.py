@@ -65,7 +65,7 @@ class Learning:
 
     def _calibrate_again(self, detection: BoardDetection) -> None:
         for k, guide in enumerate(self._guides):
-            if guide.has_camera and guide.sees(detection) and k not in self._due:
+            if not guide.is_of_peers and guide.sees(detection) and k not in self._due:
                 self._due.append(k)
 
     def teach(self) -> None:

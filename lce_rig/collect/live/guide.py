@@ -1,4 +1,4 @@
-"""The captures of a camera and a LiDAR or of two LiDARs, the next placement, and when a board is captured."""
+"""The captures of two sensors, the next placement, and when a board is captured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from lce_rig.collect.findings import (
     GUIDE_CONTINUES,
     GUIDE_NO_BEAMS,
     GUIDE_NO_NOMINAL,
+    GUIDE_OF_PEERS,
     GUIDE_PREDICTED,
-    GUIDE_WITHOUT_CAMERA,
 )
 from lce_rig.collect.gates import BEST_SPEED_MPS, MotionGate, StillnessGate, stillness_window_s
 from lce_rig.collect.guidance.instructions import Kind, instruct, is_there, say
@@ -30,21 +30,23 @@ from lce_rig.session import Capture, Session
 
 #: Another placement is proposed after a board was wanted at one for so long.
 GIVE_UP_S = 30.0
-# Two LiDARs are then known to each other within 0.04 deg and 2 mm in simulations.
-_ENOUGH_OF_LIDARS = 12
+# Two LiDARs are then known to each other within 0.04 deg and 2 mm in simulations, two cameras within 0.04 deg
+# and 8 mm.
+_ENOUGH_OF_PEERS = 12
 
 
 class Guide:
     """Guides the board before one camera and one LiDAR.
 
     Without a nominal extrinsic in the profile it begins when a first calibration is there; for a LiDAR whose
-    beams are not known there is no guidance at all. Nor is there for two LiDARs without a camera, whose
-    captures are counted.
+    beams are not known there is no guidance at all. Nor is there for two sensors of one kind, whose captures
+    are counted.
 
     Attributes:
         key: camera and channel in which the board is followed; the first of two LiDARs, and "".
-        lidar: name of the LiDAR.
-        has_camera: whether it is not of two LiDARs.
+        lidar: name of the LiDAR, or of the second camera.
+        second: its key, or the second camera's.
+        is_of_peers: whether both sensors are of one kind.
         problem: why there is no guidance yet; None while there is.
         guidance: the latest; None before the first.
     """
@@ -53,7 +55,8 @@ class Guide:
         """Begin without captures."""
         self.key = key
         self.lidar = lidar
-        self.has_camera = key[0] in rig.cameras
+        self.second = lidar, _channel_of(rig, lidar)
+        self.is_of_peers = key[0] in rig.lidars or lidar in rig.cameras
         self.problem: Finding | None = None
         self.guidance: Guidance | None = None
         self._min_captures = rig.quality.min_captures
@@ -67,9 +70,9 @@ class Guide:
         self._planner: Planner | None = None
         self._at_first: tuple[Planner | None, Finding | None]
         self._model: SensorModel | None = None
-        self._n_enough = max(_ENOUGH_OF_LIDARS, rig.quality.min_captures)
-        if not self.has_camera:
-            self.problem = GUIDE_WITHOUT_CAMERA(n_captures=self._n_enough)
+        self._n_enough = max(_ENOUGH_OF_PEERS, rig.quality.min_captures)
+        if self.is_of_peers:
+            self.problem = GUIDE_OF_PEERS(n_captures=self._n_enough)
             self._at_first = None, self.problem
             return
         try:
@@ -92,8 +95,8 @@ class Guide:
 
     @property
     def is_enough(self) -> bool:
-        """Whether the target is predicted to be met, or two LiDARs have captures enough."""
-        if not self.has_camera:
+        """Whether the target is predicted to be met, or two sensors of one kind have captures enough."""
+        if self.is_of_peers:
             return self.n_held >= self._n_enough
         return self.guidance is not None and self.guidance.is_enough
 
@@ -119,9 +122,10 @@ class Guide:
 
     def sees(self, detection: BoardDetection) -> bool:
         """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
-        if not self.has_camera:
-            return {self.key[0], self.lidar} <= detection.lidars.keys()
-        return self.key in detection.images.keys() - detection.unfit.keys() and self.lidar in detection.lidars
+        seen = {(lidar, "") for lidar in detection.lidars} | (
+            detection.images.keys() - detection.unfit.keys()
+        )
+        return {self.key, self.second} <= seen
 
     def add(self, name: str, T_cam_board: Array) -> None:
         """Take a capture into account; the next placement is chosen by `plan`."""
@@ -192,7 +196,7 @@ class Guide:
 
     def adds_nothing(self, present: Array) -> Refusal | None:
         """Say why a board (4, 4) need not be captured where it is; None where it adds something."""
-        if not self.has_camera:
+        if self.is_of_peers:
             is_alike = find_alike(self._held_poses(), present[None], MIN_MOVE_M, np.radians(MIN_TURN_DEG))
             return CALIBRATE_SAME_PLACEMENT.refusal() if is_alike.any() else None
         if self._planner is None:
@@ -268,7 +272,8 @@ def count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> Non
     except LceRigError:
         return  # A damaged capture is named when it is used.
     for guide in guides:
-        if guide.key in poses and guide.lidar in lidars:
+        seen = {*poses, *((lidar, "") for lidar in lidars)}
+        if guide.key in poses and guide.second in seen:
             guide.add(capture.name, poses[guide.key])
 
 
@@ -287,16 +292,21 @@ def predict(session: Session) -> list[Finding]:
 def make_guides(rig: Rig) -> list[Guide]:
     """Make a guide for every camera with every LiDAR: by its frames where it has any.
 
-    Without cameras, make one for the first LiDAR with each other.
+    In a rig of one kind of sensor, make one for the first with each other.
     """
-    if not rig.cameras:
-        first, *others = rig.lidars
-        return [Guide(rig, (first, ""), lidar) for lidar in others]
-    keys: list[ImageKey] = [
-        (name, camera.first_channel("frames") or next(iter(camera.channels)))
-        for name, camera in rig.cameras.items()
-    ]
+    if not rig.cameras or not rig.lidars:
+        first, *others = [*rig.lidars, *rig.cameras]
+        return [Guide(rig, (first, _channel_of(rig, first)), other) for other in others]
+    keys: list[ImageKey] = [(name, _channel_of(rig, name)) for name in rig.cameras]
     return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]
+
+
+def _channel_of(rig: Rig, sensor: str) -> str:
+    """Name the channel in which a camera shows the board, its frames where it has any; "" for a LiDAR."""
+    if sensor in rig.lidars:
+        return ""
+    camera = rig.cameras[sensor]
+    return camera.first_channel("frames") or next(iter(camera.channels))
 
 
 _HOLD, _MOVE = "hold still", f"move it slowly, about {100 * BEST_SPEED_MPS:.0f} cm/s"
@@ -327,17 +337,18 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
         reasons: the last refusal of each stream, by its name.
     """
     lidar = guide.lidar
-    if not guide.has_camera and guide.key[0] not in detection.lidars:
+    if not guide.key[1] and guide.key[0] not in detection.lidars:
         lidar = guide.key[0]
-    if guide.has_camera and guide.key not in detection.images:
-        why = reasons.get(".".join(guide.key))
-        # An image without a board hardly tells why; one with half a board does.
-        headline = f"show the board to {guide.key[0]}" if detection.images else _SHOW
-        return Narration("searching", headline, why.sentence if why else "")
-    if guide.key in detection.unfit:
-        why = detection.unfit[guide.key]
-        headline = _next(guide, detection.images[guide.key].T_cam_board, why.advice)
-        return Narration("moving", headline, f"cannot be used here: {why.text}")
+    for key in (each for each in (guide.key, guide.second) if each[1]):
+        if key not in detection.images:
+            why = reasons.get(".".join(key))
+            # An image without a board hardly tells why; one with half a board does.
+            headline = f"show the board to {key[0]}" if detection.images else _SHOW
+            return Narration("searching", headline, why.sentence if why else "")
+        if key in detection.unfit:
+            why = detection.unfit[key]
+            headline = _next(guide, detection.images[key].T_cam_board, why.advice)
+            return Narration("moving", headline, f"cannot be used here: {why.text}")
     why = reasons.get(lidar)
     headline = why.advice if why else f"show the board to {lidar}"
     return Narration("searching", headline, f"{lidar}: {why.text}" if why else "")

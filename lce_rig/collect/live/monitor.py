@@ -51,7 +51,8 @@ class Monitor:
         self._ticks_left: int | None = None
         self._lost: frozenset[str] = frozenset()
         self._was_enough = False
-        self._met = _MET if session.rig.cameras else _COUNTED
+        self._is_of_one_kind = not session.rig.cameras or not session.rig.lidars
+        self._met = _COUNTED if self._is_of_one_kind else _MET
 
     def see(self, detection: BoardDetection) -> None:
         """Take a detection, and remember why streams do not show the board."""
@@ -164,7 +165,7 @@ class Monitor:
             return "enough", _ENOUGH, said.headline
         if self._is_stale():
             waited_s = time.monotonic() - self._seen_s
-            pair = "image with a scan of its time" if self._session.rig.cameras else "scans of one time"
+            pair = "samples of one time" if self._is_of_one_kind else "image with a scan of its time"
             return "searching", _WAIT, f"no {pair} for {waited_s:.0f} s"
         return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 
