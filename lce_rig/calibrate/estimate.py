@@ -168,10 +168,10 @@ def estimate_observations(
 def _with_session_lens(
     candidates: Mapping[str, Sequence[Observation]], board: Board, settings: EstimateSettings
 ) -> tuple[Mapping[str, Sequence[Observation]], EstimateSettings]:
-    """Fit the lens of a profile that is not exact, and the boards' poses with it."""
+    """Fit the lens of a profile that is not exact, if it is not known yet, and the boards' poses with it."""
     if settings.tolerances is None or settings.tolerances.lens.is_exact:
         return candidates, settings
-    lens = fit_session_lens(candidates, board, settings.tolerances.lens)
+    lens = settings.lens or fit_session_lens(candidates, board, settings.tolerances.lens)
     refitted = {name: lens.refit(observations) for name, observations in candidates.items()}
     return refitted, replace(settings, lens=lens)
 

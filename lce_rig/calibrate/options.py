@@ -119,7 +119,7 @@ class EstimateSettings(CalibrateOptions):
         has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
         tolerances: of the profile's lens and board; None takes both as exact.
-        lens: of the session, which `estimate_extrinsics` fits first where there are tolerances.
+        lens: of the session; None to fit it first where there are tolerances.
     """
 
     laser_bias_sigma_m: float = 0.0

@@ -213,7 +213,7 @@ def find_exchanged_cameras(
     """Find two cameras whose images came under each other's name.
 
     Exchanged, they fit the profile better: the nominal poses by more than chance allows, tolerances taken as
-    three standard deviations; or the lenses, where neither fits its own camera.
+    three standard deviations; or the lenses, where boards contradict both profiles.
 
     Args:
         rig: the profile, with both cameras.
@@ -224,7 +224,7 @@ def find_exchanged_cameras(
     if _mounting_gain(rig, lidar, first, second) > _EXCHANGED_CHI2:
         reasons.append("mounting")
     sizes = [rig.cameras[each.name].resolution_px for each in (first, second)]
-    misfits = [each.lens is not None and each.lens.verdict() != "pass" for each in (first, second)]
+    misfits = [each.lens is not None and each.lens.is_contradicted for each in (first, second)]
     if all(misfits) and sizes[0] == sizes[1]:
         board = rig.board.to_board()
         lenses = [rig.cameras[each.name].to_intrinsics() for each in (second, first)]

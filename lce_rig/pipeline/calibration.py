@@ -4,7 +4,9 @@ detections -> estimate of each camera with each LiDAR, and of every two LiDARs o
 -> all sensors that agree, as one (`rig_estimate`) -> checks, verdict -> the scene's opinion
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -23,6 +25,7 @@ from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.result import error_to_reference, squares_scale
 from lce_rig.calibrate.rig_estimate import RigResult, SensorPair, estimate_rig
+from lce_rig.calibrate.session_lens import SessionLens, fit_session_lens
 from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
@@ -215,9 +218,12 @@ def calibrate_detections(
     """
     alone: list[_Solved] = []
     shortages: list[Finding] = []
-    for pairs in _pairs_by_sensors(detections, cameras, channels):
+    groups = _pairs_by_sensors(detections, cameras, channels)
+    shared = _shared_lenses(rig, detections, groups)
+    for pairs in groups:
+        lens = shared.get(pairs[0].camera)
         try:
-            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), progress))
+            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
@@ -275,10 +281,37 @@ def _pairs_by_sensors(
     return list(groups.values())
 
 
+def _shared_lenses(
+    rig: Rig, detections: Detections, groups: Sequence[Sequence[Pair]]
+) -> dict[str, SessionLens]:
+    """Fit the lens of each camera with several LiDARs once: extrinsics with other lenses differ by a turn."""
+    n_lidars = Counter(pairs[0].camera for pairs in groups)
+    seen: dict[str, dict[str, dict[str, Observation]]] = {}
+    for pair in (pair for pairs in groups for pair in pairs if n_lidars[pair.camera] > 1):
+        found, _ = candidates_of(detections, pair)
+        if len(found) >= rig.quality.min_captures:
+            of_channel = seen.setdefault(pair.camera, {}).setdefault(pair.channel, {})
+            of_channel.update({each.capture: each for each in found})
+    lenses = {}
+    for camera, by_channel in seen.items():
+        prior = Tolerances.of(rig.cameras[camera], rig.board).lens
+        observations = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
+        # A pair that is estimated reports why its lens cannot be fitted.
+        with suppress(NotEnoughDataError):
+            if not prior.is_exact:
+                lenses[camera] = fit_session_lens(observations, rig.board.to_board(), prior)
+    return lenses
+
+
 def _solve(
-    rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions, progress: Progress
+    rig: Rig,
+    detections: Detections,
+    pairs: Sequence[Pair],
+    options: CalibrateOptions,
+    lens: SessionLens | None,
+    progress: Progress,
 ) -> _Solved:
-    """Estimate the extrinsics of one camera and LiDAR from their own captures alone.
+    """Estimate the extrinsics of one camera and LiDAR from their own captures, with a lens if it is known.
 
     Raises:
         NotEnoughDataError: no channel has enough captures with both boards, or a direction is undetermined.
@@ -300,7 +333,7 @@ def _solve(
     detected = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in detected}
     tolerances = Tolerances.of(rig.cameras[camera], rig.board)
-    settings = EstimateSettings.of(options, rig.lidars[lidar], tolerances)
+    settings = replace(EstimateSettings.of(options, rig.lidars[lidar], tolerances), lens=lens)
     clocks = Clocks.of(rig, camera, lidar)
     estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
     begin(progress, f"checking {camera} and {lidar}")

@@ -76,6 +76,7 @@ def rig_table(poses: RigPoses, cameras: Collection[str]) -> Table:
     rows = []
     for each in poses.sensors:
         T = each.T_base_sensor @ invert(T_BODY_OPTICAL) if each.sensor in cameras else each.T_base_sensor
+        T = T_BODY_OPTICAL @ T if poses.base in cameras else T
         position = [f"{value:+.4f}" for value in T[:3, 3]]
         angles = [f"{value:+.3f}" for value in np.degrees(rpy(T[:3, :3]))]
         sigmas = f"{each.sigma_rotation_deg:.3f}", f"{1000 * each.sigma_translation_m:.1f}"
@@ -85,7 +86,7 @@ def rig_table(poses: RigPoses, cameras: Collection[str]) -> Table:
 
 
 def _pose_rows(c: Calibration) -> list[Row]:
-    """State the pose of the camera's body in the LiDAR's frame; of two of a kind, the second's in the first's.
+    """State the pose of the camera's body in the LiDAR's frame, or of the second of a kind in the first's.
 
     Standard deviations belong to it.
     """

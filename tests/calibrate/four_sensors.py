@@ -20,13 +20,29 @@ ON_FRONT = {
 SENSORS = tuple(ON_FRONT)
 
 
-def make_rig(sensors=SENSORS):
-    """Build the profile of some of the sensors, with exact nominal poses."""
-    lens = {
-        "model": "radtan",
-        **{key: getattr(CAMERA, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")},
-        "distortion": list(CAMERA.distortion),
-    }
+def make_rig(sensors=SENSORS, seed=None):
+    """Build the profile of some of the sensors, with exact nominal poses.
+
+    With a seed, lenses and board have errors with the standard deviations that the profile states.
+    """
+    rng = np.random.default_rng([seed or 0, 11])
+    error = (lambda *size: rng.standard_normal(size)) if seed is not None else np.zeros
+    sigma = {"focal_sigma_px": 3.0, "principal_point_sigma_px": 3.0, "distortion_sigma_px": 0.01}
+
+    def lens():
+        focal = 1 + sigma["focal_sigma_px"] / CAMERA.fx_px * error(1)[0]
+        middle_px = sigma["principal_point_sigma_px"] * error(2)
+        return {
+            "model": "radtan",
+            "fx_px": focal * CAMERA.fx_px,
+            "fy_px": focal * CAMERA.fy_px,
+            "cx_px": CAMERA.cx_px + middle_px[0],
+            "cy_px": CAMERA.cy_px + middle_px[1],
+            "distortion": list(CAMERA.distortion),
+            **sigma,
+        }
+
+    square, plate_m = 1 + 1e-3 * error(1)[0], 1e-3 * error(2)
     cameras, lidars = (
         [name for name in sensors if name in names] for names in (("left", "right"), ("front", "rear"))
     )
@@ -36,7 +52,14 @@ def make_rig(sensors=SENSORS):
             "name": "four",
             "board": {
                 "inner_corners": [BOARD.cols, BOARD.rows],
-                **{key: getattr(BOARD, key) for key in ("square_m", "width_m", "height_m")},
+                "square_m": BOARD.square_m * square,
+                "square_sigma_m": 1e-3 * BOARD.square_m,
+                "width_m": BOARD.width_m + plate_m[0],
+                "height_m": BOARD.height_m + plate_m[1],
+                "plate_sigma_m": 1e-3,
+                "pattern_offset_m": (1e-3 * error(2)).tolist(),
+                "pattern_offset_sigma_m": 1e-3,
+                "bow_sigma_m": 1e-4,
             },
             "lidars": {
                 name: {"model": "VLP-16", "frame": f"{name}_link", "topic": f"/{name}"} for name in lidars
@@ -46,7 +69,7 @@ def make_rig(sensors=SENSORS):
                     "frame": f"{name}_link",
                     "optical_frame": f"{name}_optical",
                     "resolution_px": [CAMERA.width_px, CAMERA.height_px],
-                    "intrinsics": lens,
+                    "intrinsics": lens(),
                     "channels": {"frames": {"kind": "frames", "topic": f"/{name}/image_raw"}},
                 }
                 for name in cameras
