@@ -96,6 +96,8 @@ _EFFORT = 0.01
 _MOST_MORE = 60
 # Number of captures of each reachable placement in the limit of many.
 _MANY = 1e4
+# Number of placements, the best for one pair of sensors, that are weighed for others, too.
+_BEST = 40
 
 
 class Guidance(NamedTuple):
@@ -122,6 +124,20 @@ class Guidance(NamedTuple):
     bound_translation_m: float
     n_more: int | None
     T_cam_board: Array | None
+
+
+class Beside(NamedTuple):
+    """Another pair of sensors that may see the same board.
+
+    Attributes:
+        planner: of it.
+        T_other_cam: (4, 4) from the camera's frame to that of its camera.
+        held: (N, 4, 4) T_cam_board of its captures, frame of its camera.
+    """
+
+    planner: "Planner"
+    T_other_cam: Array
+    held: Array
 
 
 class Planner:
@@ -154,14 +170,22 @@ class Planner:
         limit = self._predictor.combine(self._evidence, weight=_MANY).without_pattern
         self._limit = limit if len(self.candidates) else np.zeros_like(limit)
 
-    def guide(self, held: Array, present: Array | None = None, avoid: Array | None = None) -> Guidance:
-        """Say how well the extrinsic is known, and where the board should go.
+    def guide(
+        self,
+        held: Array,
+        present: Array | None = None,
+        avoid: Array | None = None,
+        beside: Sequence[Beside] = (),
+    ) -> Guidance:
+        """Predict how well the extrinsics are known, and choose where the board should go.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far; N may be 0.
             present: (4, 4) where the board is now; of placements that are nearly as good the nearest wins.
             avoid: (M, 4, 4) placements that cannot be reached, or where a sensor does not find the board:
                 something is in the way, so that others near them are not asked for either.
+            beside: other pairs of sensors: of placements that are nearly as good, the one that also helps
+                them wins.
         """
         model = self.view.model
         evidence = self._predictor.weigh(held)
@@ -176,6 +200,13 @@ class Planner:
         if avoid is not None:
             way_m = np.linalg.norm(avoid[:, None, :3, 3] - self.candidates[:, :3, 3], axis=-1)
             cost[way_m.min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
+        if beside:
+            few = np.argsort(cost, kind="stable")[:_BEST]
+            for other in beside:
+                cost[few] += other.planner.shortfall_after(
+                    other.held, other.T_other_cam @ self.candidates[few]
+                )
+            cost[np.setdiff1d(np.arange(len(cost)), few)] += np.inf
         best = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
@@ -200,6 +231,31 @@ class Planner:
             ),
             T_cam_board=wanted,
         )
+
+    def shortfall_after(self, held: Array, placements: Array) -> Array:
+        """Predict the shortfall from the target after each one of further placements, seen or not.
+
+        Args:
+            held: (N, 4, 4) T_cam_board of the captures so far.
+            placements: (K, 4, 4) T_cam_board.
+
+        Returns:
+            (K,) as `evidence.shortfall`.
+        """
+        model, evidence = self.view.model, self._predictor.weigh(held)
+        pixels, is_valid = model.lens.project(
+            np.einsum("kij,nj->kni", placements[:, :3, :3], model.board.corners())
+            + placements[:, None, :3, 3]
+        )
+        is_seen = np.all(is_valid & model.lens.is_inside(pixels), axis=1)
+        more = self._predictor.weigh(placements)
+        is_seen &= (more.n_rings > model.limits.min_rings) & (more.n_points >= model.limits.min_points)
+        now = shortfall(model, self._predictor.combine(evidence).without_pattern - self._limit)
+        found = np.full(len(placements), float(now))
+        if is_seen.any():
+            after = self._predictor.combine(evidence, more.of(is_seen)).without_pattern - self._limit
+            found[is_seen] = shortfall(model, after)
+        return found
 
     def adds_nothing(
         self,

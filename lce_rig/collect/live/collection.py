@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -209,12 +210,19 @@ class _Loop:
         moments = gate.take(detection)
         guide, poses = self._active_guide(detection), detection.poses
         for planned in self._guides:
-            planned.plan(poses.get(planned.key), _time_s(detection), is_asked=planned is guide)
+            planned.plan(
+                poses.get(planned.key),
+                _time_s(detection),
+                is_asked=planned is guide,
+                others=self._guides if planned is guide else (),
+            )
         present = poses.get(guide.key)
         if present is not None and guide.sees(detection):
             narration = gate.narrate(guide, present)
         else:
             narration = narrate_unseen(detection, guide, self._monitor.reasons)
+        if len(self._guides) > 1 and narration.phase == "moving":
+            narration = replace(narration, headline=f"{guide.key[0]}: {narration.headline}")
         for moment in moments:
             narration = self._decide(moment, narration)
         self._monitor.narrate(narration, guide, present)
@@ -355,19 +363,19 @@ class _Loop:
         )
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
-        """Pick the guide to show: among those that see the board, the one with fewest captures.
+        """Pick the guide to show: among those that see the board, the one that needs captures most.
 
         Where they all have enough, the board goes before a camera whose guide has not.
         """
         seeing = [g for g in self._guides if g.key in detection.poses]
         if seeing and all(guide.is_enough for guide in seeing):
             seeing += [guide for guide in self._guides if not guide.is_enough]
-            return min(seeing, key=lambda guide: (guide.is_enough, guide.n_held))
-        return min(seeing or self._guides, key=lambda guide: guide.n_held)
+            return max(seeing, key=lambda guide: (not guide.is_enough, guide.need))
+        return max(seeing or self._guides, key=lambda guide: guide.need)
 
     def _seeing_guide(self, detection: BoardDetection) -> Guide | None:
-        """Pick the judge of a placement: among guides that see it, the one with fewest captures."""
-        return min((g for g in self._guides if g.sees(detection)), key=lambda g: g.n_held, default=None)
+        """Pick the judge of a placement: among guides that see it, the one that needs captures most."""
+        return max((g for g in self._guides if g.sees(detection)), key=lambda g: g.need, default=None)
 
     def _find_gate(self) -> StillBoards | SlowBoards:
         """Choose the gate: moving boards where events come and clocks are synchronised, else still ones."""

@@ -17,13 +17,20 @@ from lce_rig.collect.findings import (
 )
 from lce_rig.collect.gates import BEST_SPEED_MPS, MotionGate, StillnessGate, stillness_window_s
 from lce_rig.collect.guidance.instructions import Kind, instruct, is_there, say
-from lce_rig.collect.guidance.planner import ENOUGH_SHARE, Coverage, Guidance, Planner, measure_coverage
+from lce_rig.collect.guidance.planner import (
+    ENOUGH_SHARE,
+    Beside,
+    Coverage,
+    Guidance,
+    Planner,
+    measure_coverage,
+)
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.collect.live.state import Phase
 from lce_rig.collect.placement_dedupe import MIN_MOVE_M, MIN_TURN_DEG, Placements, capture_poses, find_alike
 from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.findings import Finding, Losses, Refusal
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, invert
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -106,6 +113,16 @@ class Guide:
         return self.n_held >= self._min_captures if self._planner is None else self.is_enough
 
     @property
+    def need(self) -> float:
+        """How far the captures are from enough: 1 where the target is predicted to be met."""
+        if self.guidance is None:
+            return (self._n_enough if self.is_of_peers else self._min_captures) / max(self.n_held, 0.5)
+        return max(
+            self.guidance.bound_rotation_deg / (ENOUGH_SHARE * self._target_deg),
+            1000 * self.guidance.bound_translation_m / (ENOUGH_SHARE * self._target_mm),
+        )
+
+    @property
     def why_none(self) -> str:
         """Say why there is no guidance; "" while there is."""
         return self.problem.sentence if self.problem else ""
@@ -159,13 +176,21 @@ class Guide:
         if self._planner is not before:
             self.guidance = self._coverage = None
 
-    def plan(self, present: Array | None, now_s: float, *, is_asked: bool = True) -> None:
+    def plan(
+        self,
+        present: Array | None,
+        now_s: float,
+        *,
+        is_asked: bool = True,
+        others: Sequence["Guide"] = (),
+    ) -> None:
         """Choose the next placement where none is chosen, or the last was not reached for long.
 
         Args:
             present: (4, 4) where the board is; None where it is not seen.
             now_s: by the sensors' clock.
             is_asked: whether this guide is the one that is followed.
+            others: of the rig, whose sensors may see the board, too.
         """
         if self._planner is None:
             return
@@ -175,13 +200,25 @@ class Guide:
             return
         if self.guidance is not None:
             self.give_up()
-        guidance = self._planner.guide(self._held_poses(), present, self._avoided())
+        beside = [each for other in others if (each := self._beside(other)) is not None]
+        guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         if guidance.T_cam_board is None and self._avoid:
             # Obstacles may be gone: ask again rather than for nothing.
             del self._avoid[:-1]
-            guidance = self._planner.guide(self._held_poses(), present, self._avoided())
+            guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         self.guidance = guidance
         self._wanted_since_s = now_s
+
+    def _beside(self, other: "Guide") -> Beside | None:
+        """Relate another guide that still needs captures, by the camera or the LiDAR that both have."""
+        if self._planner is None or other._planner is None or other is self or other.is_enough:
+            return None
+        own, its = self._planner.view.T_cam_lidar, other._planner.view.T_cam_lidar
+        if other.key == self.key:
+            return Beside(other._planner, np.eye(4), other._held_poses())
+        if other.lidar == self.lidar:
+            return Beside(other._planner, its @ invert(own), other._held_poses())
+        return None
 
     def note_refusal(self, present: Array) -> None:
         """Ask for another placement where a board (4, 4) was refused though it is as wanted."""
