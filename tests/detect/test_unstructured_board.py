@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scans import BOARD, Box, Plate, Shape, board_plate, outline_distance, person, place, room
+from scans import BOARD, Box, Plate, Shape, accumulate, board_plate, outline_distance, person, place, room
 
-from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, perturb, pose
 from lce_rig.core.results import LidarBoard
@@ -15,21 +14,6 @@ from lce_rig.detect.lidar.search import Limits
 from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
 
 POINT_BEAM = Limits(beam=Beam(0.0, 0.0, 0.0))
-
-
-def accumulate(
-    shapes: list[Shape], sigma_m: float = 0.01, seed: int = 0, n: int = 120_000, fov_deg: float = 70.0
-) -> Scan:
-    """Cast rays in random directions of a cone ahead, as a rosette does in a while."""
-    rng = np.random.default_rng(seed)
-    across, turn = np.radians(fov_deg / 2) * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    rays = np.column_stack([np.cos(across), np.sin(across) * np.cos(turn), np.sin(across) * np.sin(turn)])
-    range_m = np.min([shape.ranges(rays) for shape in shapes], axis=0)
-    keep = np.isfinite(range_m)
-    points = rays[keep] * (range_m[keep] + sigma_m * rng.standard_normal(int(keep.sum())))[:, None]
-    points = points.astype(np.float32)
-    rings = np.full(len(points), NO_RING, dtype=np.int16)
-    return Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
 
 
 def best(found: list[LidarBoard] | Refusal) -> LidarBoard:
