@@ -24,6 +24,8 @@ from lce_rig.detect.lidar.template import (
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
 _MAD = 1.4826  # the standard deviation of normal noise over its median size
+_QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
+_MIN_SMEARED = 8  # ring ends, fewest whose scatter measures a smear: a fit takes five freedoms
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
 
@@ -159,6 +161,31 @@ def measure_size(
         placement.error_m,
     )
     return fitted, size_sigma_m, residual, step_m
+
+
+def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Array) -> Array:
+    """Measure by how much ring ends scatter about the border beyond their steps: (E,) m, 0 where it is sharp.
+
+    The third quartile of their distances measures it, of all ends and of each side's: a few that lost their
+    last returns do not count.
+
+    Args:
+        ends: ring ends.
+        side: (E,) side of the fitted rectangle that each is nearest to.
+        residual_m, step_m: of them, by `measure_size`.
+    """
+    smear_m = np.zeros(len(side))
+    for among in (ends.is_border, *(ends.is_border & (side == k) for k in range(4))):
+        n = int(np.count_nonzero(among))
+        if n < _MIN_SMEARED:
+            continue
+        spread_m = float(np.percentile(np.abs(residual_m[among]), 75)) / _QUARTILE
+        # Ends are uniform over a step without noise. The fit takes five freedoms of all of them.
+        excess_m2 = spread_m**2 - (0.375 * median(step_m[among]) / _QUARTILE) ** 2
+        excess_m = np.sqrt(max(excess_m2, 0.0) * n / (n - 5.0))
+        if excess_m > EDGE_TOLERANCE_M:
+            smear_m[among] = np.maximum(smear_m[among], excess_m)
+    return smear_m
 
 
 SURROUND_M = 0.20
@@ -301,7 +328,11 @@ def build_board(
     is_board = view.is_on & (away <= beyond_m + EDGE_TOLERANCE_M)
     if is_board.sum() < MIN_POINTS:
         return None
-    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m
+    local = fitted.local(view.uv[ends.beam])
+    axis = (np.abs(local) - fitted.half_m).argmax(axis=1)
+    side_of_fit = 2 * axis + (local[np.arange(len(axis)), axis] < 0)
+    smear_m = measure_smear(ends, side_of_fit, residual, step_m)
+    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m + 3 * smear_m
     is_good = ends.is_border & (np.abs(residual) <= limit_m)
     order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
     order = order[is_good[order]]
@@ -349,4 +380,5 @@ def build_board(
         T_lidar_board=view.pose_of(fitted),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
+        edge_sigma_m=smear_m[order] if smear_m.any() else None,
     )
