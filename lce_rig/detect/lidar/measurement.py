@@ -26,6 +26,7 @@ from lce_rig.detect.lidar.template import (
 _MAD = 1.4826  # the standard deviation of normal noise over its median size
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
 _MIN_SMEARED = 8  # ring ends, fewest whose scatter measures a smear: a fit takes five freedoms
+_CROSSING = 0.3  # least part of its gaps by which a ring crosses a side, for ends that show a smear
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
 
@@ -167,7 +168,7 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
     """Measure by how much ring ends scatter about the border beyond their steps: (E,) m, 0 where it is sharp.
 
     The third quartile of their distances measures it, of all ends and of each side's: a few that lost their
-    last returns do not count.
+    last returns do not count, nor do those of rings that hardly cross the side that is nearest.
 
     Args:
         ends: ring ends.
@@ -175,14 +176,15 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
         residual_m, step_m: of them, by `measure_size`.
     """
     smear_m = np.zeros(len(side))
-    for among in (ends.is_border, *(ends.is_border & (side == k) for k in range(4))):
-        n = int(np.count_nonzero(among))
+    is_telling = ends.is_border & (step_m > _CROSSING * np.linalg.norm(ends.gap, axis=1))
+    for among in (np.ones(len(side), dtype=np.bool_), *(side == k for k in range(4))):
+        n = int(np.count_nonzero(is_telling & among))
         if n < _MIN_SMEARED:
             continue
-        spread_m = float(np.percentile(np.abs(residual_m[among]), 75)) / _QUARTILE
+        spread_m = float(np.percentile(np.abs(residual_m[is_telling & among]), 75)) / _QUARTILE
         # Ends are uniform over a step without noise. The fit takes five freedoms of all of them.
-        excess_m2 = spread_m**2 - (0.375 * median(step_m[among]) / _QUARTILE) ** 2
-        excess_m = np.sqrt(max(excess_m2, 0.0) * n / (n - 5.0))
+        sharp_m = 0.375 * median(step_m[is_telling & among]) / _QUARTILE
+        excess_m = float(np.sqrt(max(spread_m**2 - sharp_m**2, 0.0) * n / (n - 5.0)))
         if excess_m > EDGE_TOLERANCE_M:
             smear_m[among] = np.maximum(smear_m[among], excess_m)
     return smear_m
@@ -262,6 +264,8 @@ def refine(
     limit_m: float,
     max_beyond: float = np.inf,
     dark_m: float = 0.0,
+    *,
+    may_be_hidden: bool = False,
 ) -> tuple[PlaneView, Placement] | None:
     """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
 
@@ -272,7 +276,7 @@ def refine(
         placement: first guess of the outline.
         limit_m: largest error of an outline; what is worse is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
-        dark_m: as in the view.
+        dark_m, may_be_hidden: as in the view.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None if too few returns lie
@@ -293,6 +297,7 @@ def refine(
         plane, spread_m = fit_plane_to_ranges(points, plane, float(np.linalg.norm(centre)))
         tolerance_m = 3.5 * spread_m + 0.004
         view = view_plane(scan.points, near, plane, view.origin, radius_m, tolerance_m, dark_m)
+        view = replace(view, may_be_hidden=may_be_hidden)
         registered = register(scan, view, placement)
         if registered is None:
             return None
