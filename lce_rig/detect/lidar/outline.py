@@ -159,37 +159,40 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
     return sorted(placements, key=lambda placement: placement.error_m)[:2]
 
 
-def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> float:
-    """Measure how far the border is smeared along width or height, m: a blur beyond that of the beam.
-
-    A plate that moved in its plane while scans were accumulated has sharp edges nowhere.
+def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Array:
+    """Measure how far each side's border is smeared, m: its blur beyond that of the beam.
 
     Args:
         rays: about the plate.
         outline: fitted to them.
         blur_m: as of `fit_outline`.
+
+    Returns:
+        (4,) of the right, left, top and bottom side.
     """
     placement = outline.placement
     near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
     near = near.select(thin(len(near.uv), _SMEAR_RAYS))
     local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
-    beam_m = blur_m(placement.axes)
-    smears = []
-    for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0])):
-        ps = (_probability(local, half, np.hypot(beam_m, smear * axis))[0] for smear in _SMEARS_M)
-        smears.append(int(np.argmax([np.sum(np.log(np.where(near.is_on, p, 1 - p))) for p in ps])))
-    return float(_SMEARS_M[max(smears)])
+    beam_m = blur_m(placement.axes)[[0, 0, 1, 1]]
+    over = np.stack([local[:, 0], -local[:, 0], local[:, 1], -local[:, 1]]) - half[[0, 0, 1, 1], None]
+    nearest = over.argmax(axis=0)
+    log_p = []
+    for smear_m in _SMEARS_M:
+        p, _ = _probability(local, half, np.hypot(beam_m, smear_m))
+        log_p.append(np.bincount(nearest, np.log(np.where(near.is_on, p, 1 - p)), 4))
+    return _SMEARS_M[np.argmax(log_p, axis=0)]
 
 
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
     """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (4, M) by each distance s_e.
 
-    Sides are right, left, top and bottom.
+    Sides are right, left, top and bottom; `blur` is of each, or of the first and the last two alike.
     """
     from scipy.special import ndtr
 
     x, y = local.T
-    half, blur = half[[0, 0, 1, 1], None], blur[[0, 0, 1, 1], None]
+    half, blur = half[[0, 0, 1, 1], None], (blur if len(blur) == 4 else blur[[0, 0, 1, 1]])[:, None]
     z = (half - [x, -x, y, -y]) / blur
     factors = ndtr(z)
     inside = factors[0] * factors[1] * factors[2] * factors[3]
@@ -206,21 +209,24 @@ class Strips(NamedTuple):
         outwards: (K, 2) unit normals.
         off_m: (K,) by how much farther out they lie than the fitted outline.
         sigma_m: (K,) standard deviations.
+        side: (K,) of `measure_smears`.
     """
 
     uv: Array
     outwards: Array
     off_m: Array
     sigma_m: Array
+    side: Indices
 
 
-def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Strips:
+def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array], smears_m: Array) -> Strips:
     """Measure where each piece of the border lies, by the mean of its shift outwards under (1).
 
     Args:
         rays: about the plate.
         outline: fitted to them.
         blur_m: as of `fit_outline`.
+        smears_m: (4,) of the sides' borders, beyond that blur.
     """
     from scipy.special import ndtr
 
@@ -233,8 +239,8 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         n_strips = max(int(length / STRIP_M), 1)
         width = length / n_strips
         along = (local[:, 1 - axis] + length / 2) / width
-        blur = float(blur_m(axes[axis][None])[0])
-        for sign in (1.0, -1.0):
+        for side, sign in ((2 * axis, 1.0), (2 * axis + 1, -1.0)):
+            blur = float(np.hypot(blur_m(axes[axis][None])[0], smears_m[side]))
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
@@ -254,5 +260,6 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             at[:, axis], at[:, 1 - axis] = sign * (half[axis] + off), middle
             uv = at @ axes + [placement.u_m, placement.v_m]
             outwards = np.tile(sign * axes[axis], (n_strips, 1))
-            parts.append([each[is_seen] for each in (uv, outwards, off, sigma_m)])
+            sides = np.full(n_strips, side)
+            parts.append([each[is_seen] for each in (uv, outwards, off, sigma_m, sides)])
     return Strips(*(np.concatenate(part) for part in zip(*parts, strict=True)))
