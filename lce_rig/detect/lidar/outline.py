@@ -29,6 +29,8 @@ _BAND_M = 0.10
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
+# Share of rays that contradict a clear plate's placement.
+_MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
@@ -139,12 +141,36 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
         rays: about a plate whose middle is near the origin.
         half_m: half width and half height.
     """
+    placements = _from_all_angles(rays, half_m, np.zeros(2))
+    if placements and placements[0].error_m > _MOST_CLEAR_MISSES:
+        placements += _from_all_angles(rays, half_m, _middle_of_wide(rays, half_m))
+    return sorted(placements, key=lambda placement: placement.error_m)[:2]
+
+
+def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
+    """Find the middle (2,) of what is wider than half the plate's short side, m: a stand is narrower.
+
+    The middle of a patch lies towards the stand that its plate merges with.
+    """
+    from scipy.spatial import cKDTree
+
+    on, beside = rays.uv[rays.is_on], rays.uv[~rays.is_on]
+    if len(beside) == 0:
+        return np.zeros(2)
+    on = on[thin(len(on), _FEW_RAYS)]
+    away_m, _ = cKDTree(beside).query(on)
+    deep = on[(away_m > min(half_m) / 2) & ((on**2).sum(axis=1) < np.hypot(*half_m) ** 2)]
+    return np.asarray(deep.mean(axis=0)) if len(deep) else np.zeros(2)
+
+
+def _from_all_angles(rays: Rays, half_m: tuple[float, float], middle: Array) -> list[Placement]:
+    """Fit the rectangle from all angles about a point (2,), best first."""
     radius_m = 1.25 * float(np.hypot(*half_m))
-    about = rays.select((rays.uv**2).sum(axis=1) < radius_m**2)
+    about = rays.select(((rays.uv - middle) ** 2).sum(axis=1) < radius_m**2)
     few = about.select(thin(len(about.uv), _FEW_RAYS))
     placements = []
     for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
-        start = Placement(0.0, 0.0, float(angle), half_m)
+        start = Placement(*middle.tolist(), float(angle), half_m)
         fit = fit_outline(
             few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), _WIDE_M
         )
@@ -156,7 +182,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
             )
             share = float(misses / max(np.count_nonzero(on & (distance <= 0.02)), 1))
             placements.append(replace(fit.placement, error_m=share))
-    return sorted(placements, key=lambda placement: placement.error_m)[:2]
+    return sorted(placements, key=lambda placement: placement.error_m)
 
 
 def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Array:
