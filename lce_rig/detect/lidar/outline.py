@@ -141,9 +141,9 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
         rays: about a plate whose middle is near the origin.
         half_m: half width and half height.
     """
-    placements = _from_all_angles(rays, half_m, np.zeros(2))
+    placements = _from_all_angles(rays, half_m, np.zeros(2), _WIDE_M)
     if placements and placements[0].error_m > _MOST_CLEAR_MISSES:
-        placements += _from_all_angles(rays, half_m, _middle_of_wide(rays, half_m))
+        placements += _from_all_angles(rays, half_m, _middle_of_wide(rays, half_m), _ANNEALED_M)
     return sorted(placements, key=lambda placement: placement.error_m)[:2]
 
 
@@ -163,8 +163,10 @@ def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
     return np.asarray(deep.mean(axis=0)) if len(deep) else np.zeros(2)
 
 
-def _from_all_angles(rays: Rays, half_m: tuple[float, float], middle: Array) -> list[Placement]:
-    """Fit the rectangle from all angles about a point (2,), best first."""
+def _from_all_angles(
+    rays: Rays, half_m: tuple[float, float], middle: Array, annealed_m: tuple[float, ...]
+) -> list[Placement]:
+    """Fit the rectangle from all angles about a point (2,), best first; `annealed_m` as of `fit_outline`."""
     radius_m = 1.25 * float(np.hypot(*half_m))
     about = rays.select(((rays.uv - middle) ** 2).sum(axis=1) < radius_m**2)
     few = about.select(thin(len(about.uv), _FEW_RAYS))
@@ -172,7 +174,7 @@ def _from_all_angles(rays: Rays, half_m: tuple[float, float], middle: Array) -> 
     for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
         start = Placement(*middle.tolist(), float(angle), half_m)
         fit = fit_outline(
-            few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), _WIDE_M
+            few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), annealed_m
         )
         if fit is not None:
             distance = fit.placement.distance_m(about.uv)
