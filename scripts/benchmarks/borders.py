@@ -136,4 +136,8 @@ def claim_at(found: LidarBoard, T_lidar_board: Array) -> tuple[Array, Array]:
 
 def upright(T_lidar_board: Array, found: Array) -> Array:
     """Turn the true pose by half a turn where the one found is."""
-    return T_lidar_board @ np.diag([-1.0, -1.0, 1.0, 1.0]) if T_lidar_board[:3, 0] @ found[:3, 0] < 0 else T_lidar_board
+    return (
+        T_lidar_board @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        if T_lidar_board[:3, 0] @ found[:3, 0] < 0
+        else T_lidar_board
+    )

@@ -282,7 +282,9 @@ def screen_plates(
         # The first and the last return of each chord, in two runs.
         for row in relative:
             n = np.count_nonzero(~np.isnan(row[:, 0])) // 2
-            is_short = np.linalg.norm(row[n : 2 * n] - row[:n], axis=1) < min(board.width_m, board.height_m) / 2
+            is_short = (
+                np.linalg.norm(row[n : 2 * n] - row[:n], axis=1) < min(board.width_m, board.height_m) / 2
+            )
             if 0 < np.count_nonzero(is_short) <= n - MIN_LONG:
                 row[: 2 * n][np.tile(is_short, 2)] = np.nan
                 row[:] = row[np.argsort(np.isnan(row[:, 0]), kind="stable")]

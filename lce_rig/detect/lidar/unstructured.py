@@ -468,10 +468,17 @@ def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | N
     places, covs = [], []
     for rows in np.array_split(np.arange(len(view.uv)), _N_PARTS):
         part = replace(
-            view, member=view.member[rows], uv=view.uv[rows], height_m=view.height_m[rows], returns=view.returns[rows]
+            view,
+            member=view.member[rows],
+            uv=view.uv[rows],
+            height_m=view.height_m[rows],
+            returns=view.returns[rows],
         )
         fit = fit_outline(
-            part.rays(placement.half_m, placement), placement, lambda axes: np.hypot(view.blur_m(axes), smear_m), growth
+            part.rays(placement.half_m, placement),
+            placement,
+            lambda axes: np.hypot(view.blur_m(axes), smear_m),
+            growth,
         )
         if fit is not None:
             places.append([fit.placement.u_m, fit.placement.v_m])
