@@ -28,7 +28,10 @@ format_version: 1
 name: borders
 board: {{inner_corners: [8, 6], square_m: 0.07, width_m: 0.767, height_m: 0.626}}
 lidars: {{lidar: {{model: {model}}}}}
-cameras: {{cam: {{resolution_px: [1280, 720], intrinsics: {{fx_px: 900, fy_px: 900, cx_px: 640, cy_px: 360}}}}}}
+cameras:
+  cam:
+    resolution_px: [1280, 720]
+    intrinsics: {{fx_px: 900, fy_px: 900, cx_px: 640, cy_px: 360}}
 """
 _NOISE_M = 0.008
 _OS1_DEG = np.linspace(-16.6, 16.6, 64)

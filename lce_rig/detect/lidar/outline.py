@@ -172,7 +172,7 @@ def _from_all_angles(
     few = about.select(thin(len(about.uv), _FEW_RAYS))
     placements = []
     for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
-        start = Placement(*middle.tolist(), float(angle), half_m)
+        start = Placement(float(middle[0]), float(middle[1]), float(angle), half_m)
         fit = fit_outline(
             few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), annealed_m
         )
@@ -209,7 +209,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
     for smear_m in _SMEARS_M:
         p, _ = _probability(local, half, np.hypot(beam_m, smear_m))
         log_p.append(np.bincount(nearest, np.log(np.where(near.is_on, p, 1 - p)), 4))
-    return _SMEARS_M[np.argmax(log_p, axis=0)]
+    return np.asarray(_SMEARS_M[np.argmax(log_p, axis=0)])
 
 
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
