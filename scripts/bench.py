@@ -13,8 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-# The stand-ins of devices: tests/wire.
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+# The stand-ins of devices, tests/wire, and simulated scans, tests/detect.
+_TESTS = Path(__file__).resolve().parents[1] / "tests"
+sys.path += [str(_TESTS), str(_TESTS / "detect")]
 
 Part = Callable[[Any, argparse.Namespace], None]
 PARTS: dict[str, tuple[str, Part]] = {
@@ -59,6 +60,10 @@ PARTS: dict[str, tuple[str, Part]] = {
     "boards": (
         "checkerboards and boards with markers, whole and covered: poses in images",
         lambda bench, a: bench(a.captures or 60),
+    ),
+    "borders": (
+        "boards in scans whose border is hidden, smeared or merges with a stand, simulated",
+        lambda bench, a: bench(a.captures or 50, a.only),
     ),
     "growth": ("calibrate as sessions grow: time and memory", lambda bench, a: bench(a.output)),
     "fleet": ("sessions of many robots", lambda bench, a: bench(a.output, a.only)),

@@ -158,6 +158,8 @@ class LidarBoard:
             board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
         edge_beam_m: (M, 2) of a board without rings: half the beam's width along the edge's normal, already
             subtracted from the edge points, as the sum of what its width and its height add; None with rings.
+        edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
+            standard deviation; None where the whole border is sharp.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
@@ -182,6 +184,7 @@ class LidarBoard:
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
     edge_beam_m: Array | None = None
+    edge_sigma_m: Array | None = None
 
     def corrected(self, range_offset_m: float) -> "LidarBoard":
         """Subtract a constant from all ranges of the board, as `Scan.corrected` does before it is detected.

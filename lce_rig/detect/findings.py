@@ -210,11 +210,10 @@ LIDAR_TOO_THICK = Kind(
     "the board moved during the scan or is not flat",
     "hold the board still, or put it on a stand",
 )
-LIDAR_SMEARED = Kind(
-    "lidar.smeared",
-    "border of the board at {distance_m:.1f} m smeared by {smear_m:mm} (limit {max_smear_m:mm}): "
-    "board or LiDAR moved while scans were accumulated, or something touches an edge",
-    "keep board and LiDAR still, boxes and hands 0.1 m from its edges",
+LIDAR_MOVED = Kind(
+    "lidar.moved",
+    "board or LiDAR moved by {moved_m:mm} while scans of the board at {distance_m:.1f} m were accumulated",
+    "keep board and LiDAR still",
 )
 LIDAR_TOUCHING = Kind(
     "lidar.touching",
@@ -227,11 +226,6 @@ LIDAR_OUTLINE = Kind(
     "plate outline at {distance_m:.1f} m: error {error_m:mm} (limit {max_error_m:mm}), "
     "{hidden_share:percent} of the board occluded",
     "show the whole board, with nothing in front of it or at its edges",
-)
-LIDAR_HIDDEN = Kind(
-    "lidar.hidden",
-    "{hidden_share:percent} of the board at {distance_m:.1f} m is hidden",
-    "show the whole board, with nothing in front of it",
 )
 LIDAR_NO_BORDER = Kind(
     "lidar.no_border",

@@ -85,7 +85,7 @@ def turned(scan, deg_s):
 @pytest.mark.parametrize("deg_s", [1.0, 4.0])
 def test_a_lidar_that_turns_while_scans_are_accumulated_is_refused(lce_rig, spoil, deg_s):
     session = spoil(lambda scan, _: turned(scan, deg_s))
-    assert codes_of(lce_rig, session).count("lidar.smeared") >= 4
+    assert codes_of(lce_rig, session).count("lidar.moved") >= 4
     assert lce_rig("calibrate", session).code == 6
 
 
@@ -94,7 +94,7 @@ def test_a_board_that_moves_while_scans_are_accumulated_is_refused(lce_rig, stan
     words = (tmp_path / "moving", "--rig", standing / "rig.yaml", "--motion", "moving", "--captures", 3)
     assert lce_rig("simulate", *words).code == 0
     codes = codes_of(lce_rig, tmp_path / "moving")
-    assert len(codes) == 3 and "lidar.smeared" in codes
+    assert len(codes) == 3 and "lidar.moved" in codes
     assert lce_rig("calibrate", tmp_path / "moving").code == 6
 
 
@@ -116,7 +116,7 @@ def test_a_recording_of_a_turning_lidar_gives_no_capture_and_its_cause(
     assert outcome.code == (0 if n_captures else 6)
     assert len(Session.open(tmp_path / "s").captures) == n_captures
     *_, collected = map(json.loads, (tmp_path / "s" / "journal.jsonl").read_text().splitlines())
-    assert ("lidar.smeared" in collected["counts"]) == (not n_captures)
+    assert ("lidar.moved" in collected["counts"]) == (not n_captures)
 
 
 @pytest.mark.long
@@ -140,7 +140,7 @@ def test_a_box_that_touches_the_plate_gives_no_wrong_result(lce_rig, spoil, deep
 
     session = spoil(touched)
     codes = codes_of(lce_rig, session)
-    touched = {"lidar.touching", "lidar.other_plate", "lidar.hidden", "lidar.smeared"}
+    touched = {"lidar.touching", "lidar.other_plate", "lidar.moved"}
     assert set(codes) <= touched | {"lidar.not_where_expected"}
     assert bool(codes) == (deep_m == 0.0) and len(codes) <= n
     assert lce_rig("calibrate", session).code == (6 if len(codes) > 1 else 0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.core.board import Board
-from lce_rig.core.data import Scan
+from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 
 VLP16_DEG = np.arange(-15.0, 16.0, 2.0)
@@ -126,6 +126,7 @@ def cast(
     start_deg=0.0,
     mixed_share=0.0,
     max_range_m=100.0,
+    stagger=0.0,
 ):
     """Cast one revolution, in order of firing, clockwise as a VLP-16 turns.
 
@@ -138,6 +139,7 @@ def cast(
         start_deg: azimuth of the first firing.
         mixed_share: share of the beams over an edge that return from between the two surfaces.
         max_range_m: beams that go farther return nothing.
+        stagger: steps of the rotor from one laser's firing to the next one's, as lasers fire in turn.
     """
     rng = np.random.default_rng(seed)
     azimuth = np.radians(start_deg - step_deg * (np.arange(int(360 / step_deg)) + rng.uniform()))
@@ -146,6 +148,7 @@ def cast(
         np.tile(np.arange(len(elevations_deg)), len(azimuth)),
     )
     elevation = np.radians(elevations_deg)[ring]
+    azimuth = azimuth - np.radians(step_deg) * np.mod(stagger * ring, 1.0)
 
     def trace(shift_rad):
         at = azimuth + shift_rad
@@ -171,6 +174,21 @@ def cast(
     intensity = np.full(len(points), 50.0, dtype=np.float32)
     offset_ns = (np.repeat(np.arange(len(azimuth) // len(elevations_deg)), len(elevations_deg)) * 55296)[keep]
     return Scan("lidar", 0, points, intensity, ring[keep].astype(np.int16), offset_ns.astype(np.int64))
+
+
+def accumulate(
+    shapes: list[Shape], sigma_m: float = 0.01, seed: int = 0, n: int = 120_000, fov_deg: float = 70.0
+) -> Scan:
+    """Cast rays in random directions of a cone ahead, as a rosette does in a while."""
+    rng = np.random.default_rng(seed)
+    across, turn = np.radians(fov_deg / 2) * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    rays = np.column_stack([np.cos(across), np.sin(across) * np.cos(turn), np.sin(across) * np.sin(turn)])
+    range_m = np.min([shape.ranges(rays) for shape in shapes], axis=0)
+    keep = np.isfinite(range_m)
+    points = rays[keep] * (range_m[keep] + sigma_m * rng.standard_normal(int(keep.sum())))[:, None]
+    points = points.astype(np.float32)
+    rings = np.full(len(points), NO_RING, dtype=np.int16)
+    return Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
 
 
 def outline_distance(points, T_lidar_board, board=BOARD):

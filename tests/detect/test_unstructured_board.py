@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scans import BOARD, Box, Plate, Shape, board_plate, outline_distance, person, place, room
+from scans import BOARD, Box, Plate, Shape, accumulate, board_plate, outline_distance, person, place, room
 
-from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, perturb, pose
 from lce_rig.core.results import LidarBoard
@@ -15,21 +14,6 @@ from lce_rig.detect.lidar.search import Limits
 from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
 
 POINT_BEAM = Limits(beam=Beam(0.0, 0.0, 0.0))
-
-
-def accumulate(
-    shapes: list[Shape], sigma_m: float = 0.01, seed: int = 0, n: int = 120_000, fov_deg: float = 70.0
-) -> Scan:
-    """Cast rays in random directions of a cone ahead, as a rosette does in a while."""
-    rng = np.random.default_rng(seed)
-    across, turn = np.radians(fov_deg / 2) * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    rays = np.column_stack([np.cos(across), np.sin(across) * np.cos(turn), np.sin(across) * np.sin(turn)])
-    range_m = np.min([shape.ranges(rays) for shape in shapes], axis=0)
-    keep = np.isfinite(range_m)
-    points = rays[keep] * (range_m[keep] + sigma_m * rng.standard_normal(int(keep.sum())))[:, None]
-    points = points.astype(np.float32)
-    rings = np.full(len(points), NO_RING, dtype=np.int16)
-    return Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
 
 
 def best(found: list[LidarBoard] | Refusal) -> LidarBoard:
@@ -97,18 +81,16 @@ def test_other_plates_are_refused_with_their_cause() -> None:
         return found.code
 
     assert code_of(board_plate(T, scale=1.3)) == "lidar.other_plate"
-    # A sheet in its plane at one edge; a board that hides the lower third of it; the rim of the view.
+    # A sheet in its plane at one edge, as high as the plate; the rim of the view.
     beside = pose(T[:3, :3], T[:3, 3] + T[:3, 0] * (W / 2 + 0.1))
-    assert code_of(board_plate(T), Plate(beside, 0.2, H)) in ("lidar.touching", "lidar.other_plate")
-    before = pose(T[:3, :3], 0.7 * (T[:3, 3] - T[:3, 1] * H / 3))
-    assert code_of(board_plate(T), Plate(before, W, H / 4)) in ("lidar.hidden", "lidar.other_plate")
+    assert code_of(board_plate(T), Plate(beside, 0.2, H)) in ("lidar.no_border", "lidar.other_plate")
     assert code_of(board_plate(place(3, 14, 0)), fov_deg=30.0) in ("lidar.out_of_view", "lidar.other_plate")
     assert code_of() in ("lidar.no_plate", "lidar.other_plate")
 
 
 @pytest.mark.parametrize("deep_m", [0.0, 0.1], ids=["flush", "behind"])
 @pytest.mark.parametrize("side", [0, 1], ids=["beside", "below"])
-def test_box_that_touches_the_plate_does_not_move_it(side: int, deep_m: float) -> None:
+def test_box_at_the_plate_costs_what_it_touches_only(side: int, deep_m: float) -> None:
     """A box at half of one edge, its face in the plate's plane or a hand behind it."""
     T, size_m = place(3, 5, 0, 20), np.array([BOARD.width_m, BOARD.height_m])
     box_m = np.array([0.35, 0.35, 0.3])
@@ -118,9 +100,10 @@ def test_box_that_touches_the_plate_does_not_move_it(side: int, deep_m: float) -
     box = Box(pose(T[:3, :3], T[:3, 3] + T[:3, :3] @ middle), tuple(box_m.tolist()))
     found = find_unstructured_boards(accumulate([board_plate(T), box, *room(13)]), BOARD, POINT_BEAM)
     if isinstance(found, Refusal):
-        assert found.code in ("lidar.touching", "lidar.other_plate", "lidar.hidden")
+        assert found.code == "lidar.other_plate"
     else:
-        assert_is_at(found[0], T, 0.012)
+        # The outline is a start; what the calibration takes are the places on the border.
+        assert_is_at(found[0], T, 0.04)
 
 
 @pytest.mark.parametrize("n", [0, 5, 400])

@@ -103,6 +103,7 @@ class StackedScans:
         end_fields: (M, 3, 6) as `fields`.
         end_background: (M, 3) what is behind it, `describe_background`.
         end_beam: (M, 2) half the beam's width along the edge's normal, by the beam's two axes; 0 with rings.
+        end_sigma: (M,) noise beyond that of a sharp border, m; 0 for a sharp one.
     """
 
     n_captures: int
@@ -120,6 +121,7 @@ class StackedScans:
     end_fields: Array
     end_background: Array
     end_beam: Array
+    end_sigma: Array
 
     @cached_property
     def group(self) -> Indices:
@@ -168,6 +170,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     angle = np.concatenate([board.edge_side * board.azimuth_step_rad for board in boards])[sorted_ends]
     end_rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
     beams = [np.zeros((len(b.edge_points), 2)) if b.edge_beam_m is None else b.edge_beam_m for b in boards]
+    sigmas = [np.zeros(len(b.edge_points)) if b.edge_sigma_m is None else b.edge_sigma_m for b in boards]
     return StackedScans(
         n_captures=len(boards),
         rings=rings,
@@ -184,6 +187,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         end_fields=displacements(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
         end_beam=np.concatenate(beams)[sorted_ends],
+        end_sigma=np.concatenate(sigmas)[sorted_ends],
     )
 
 
@@ -314,6 +318,7 @@ class EdgeRows:
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
+        sigma_m: (M,) noise beyond that of a sharp border.
     """
 
     group: Indices
@@ -321,10 +326,12 @@ class EdgeRows:
     step_m: Array
     range_m: Array
     is_backed: NDArray[np.bool_]
+    sigma_m: Array
 
     def blur_m(self, edge_rad: float, backed_rad: float) -> Array:
-        """Blur (M,) of each interval's ends, by `Levels`."""
-        return np.asarray(np.where(self.is_backed, backed_rad, edge_rad) * self.range_m)
+        """Blur (M,) of each interval's ends, by `Levels` and the border's own noise."""
+        sharp_m = np.where(self.is_backed, backed_rad, edge_rad) * self.range_m
+        return np.asarray(np.where(self.sigma_m > 0, np.hypot(sharp_m, self.sigma_m), sharp_m))
 
 
 def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
@@ -370,4 +377,4 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     rows[:, -1] += by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
     is_backed = scans.end_background[:, BLENDS] > 0
     group = scans.end_capture * len(scans.rings) + scans.end_ring
-    return EdgeRows(group, rows, step_m, range_m, is_backed)
+    return EdgeRows(group, rows, step_m, range_m, is_backed, scans.end_sigma)

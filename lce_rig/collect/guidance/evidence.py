@@ -267,6 +267,7 @@ class Predictor:
             end_fields=displacements(end_points, T, model.board),
             end_background=np.zeros((len(end_rays), 3)),
             end_beam=np.zeros((len(end_rays), 2)),
+            end_sigma=np.zeros(len(end_rays)),
         )
 
 

@@ -24,6 +24,9 @@ from lce_rig.detect.lidar.template import (
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
 _MAD = 1.4826  # the standard deviation of normal noise over its median size
+_QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
+_MIN_SMEARED = 8  # ring ends, fewest whose scatter measures a smear: a fit takes five freedoms
+_CROSSING = 0.3  # least part of its gaps by which a ring crosses a side, for ends that show a smear
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
 
@@ -161,6 +164,32 @@ def measure_size(
     return fitted, size_sigma_m, residual, step_m
 
 
+def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Array) -> Array:
+    """Measure by how much ring ends scatter about the border beyond their steps: (E,) m, 0 where it is sharp.
+
+    The third quartile of their distances measures it, of all ends and of each side's: a few that lost their
+    last returns do not count, nor do those of rings that hardly cross the side that is nearest.
+
+    Args:
+        ends: ring ends.
+        side: (E,) side of the fitted rectangle that each is nearest to.
+        residual_m, step_m: of them, by `measure_size`.
+    """
+    smear_m = np.zeros(len(side))
+    is_telling = ends.is_border & (step_m > _CROSSING * np.linalg.norm(ends.gap, axis=1))
+    for among in (np.ones(len(side), dtype=np.bool_), *(side == k for k in range(4))):
+        n = int(np.count_nonzero(is_telling & among))
+        if n < _MIN_SMEARED:
+            continue
+        spread_m = float(np.percentile(np.abs(residual_m[is_telling & among]), 75)) / _QUARTILE
+        # Ends are uniform over a step without noise. The fit takes five freedoms of all of them.
+        sharp_m = 0.375 * median(step_m[is_telling & among]) / _QUARTILE
+        excess_m = float(np.sqrt(max(spread_m**2 - sharp_m**2, 0.0) * n / (n - 5.0)))
+        if excess_m > EDGE_TOLERANCE_M:
+            smear_m[among] = np.maximum(smear_m[among], excess_m)
+    return smear_m
+
+
 SURROUND_M = 0.20
 MIN_POINTS = 12
 EDGE_TOLERANCE_M = 0.012
@@ -235,6 +264,8 @@ def refine(
     limit_m: float,
     max_beyond: float = np.inf,
     dark_m: float = 0.0,
+    *,
+    may_be_hidden: bool = False,
 ) -> tuple[PlaneView, Placement] | None:
     """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
 
@@ -245,7 +276,7 @@ def refine(
         placement: first guess of the outline.
         limit_m: largest error of an outline; what is worse is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
-        dark_m: as in the view.
+        dark_m, may_be_hidden: as in the view.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None if too few returns lie
@@ -266,6 +297,7 @@ def refine(
         plane, spread_m = fit_plane_to_ranges(points, plane, float(np.linalg.norm(centre)))
         tolerance_m = 3.5 * spread_m + 0.004
         view = view_plane(scan.points, near, plane, view.origin, radius_m, tolerance_m, dark_m)
+        view = replace(view, may_be_hidden=may_be_hidden)
         registered = register(scan, view, placement)
         if registered is None:
             return None
@@ -301,7 +333,11 @@ def build_board(
     is_board = view.is_on & (away <= beyond_m + EDGE_TOLERANCE_M)
     if is_board.sum() < MIN_POINTS:
         return None
-    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m
+    local = fitted.local(view.uv[ends.beam])
+    axis = (np.abs(local) - fitted.half_m).argmax(axis=1)
+    side_of_fit = 2 * axis + (local[np.arange(len(axis)), axis] < 0)
+    smear_m = measure_smear(ends, side_of_fit, residual, step_m)
+    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m + 3 * smear_m
     is_good = ends.is_border & (np.abs(residual) <= limit_m)
     order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
     order = order[is_good[order]]
@@ -349,4 +385,5 @@ def build_board(
         T_lidar_board=view.pose_of(fitted),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
+        edge_sigma_m=smear_m[order] if smear_m.any() else None,
     )

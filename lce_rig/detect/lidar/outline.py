@@ -29,6 +29,8 @@ _BAND_M = 0.10
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
+# Share of rays that contradict a clear plate's placement.
+_MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
@@ -139,14 +141,40 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
         rays: about a plate whose middle is near the origin.
         half_m: half width and half height.
     """
+    placements = _from_all_angles(rays, half_m, np.zeros(2), _WIDE_M)
+    if placements and placements[0].error_m > _MOST_CLEAR_MISSES:
+        placements += _from_all_angles(rays, half_m, _middle_of_wide(rays, half_m), _ANNEALED_M)
+    return sorted(placements, key=lambda placement: placement.error_m)[:2]
+
+
+def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
+    """Find the middle (2,) of what is wider than half the plate's short side, m: a stand is narrower.
+
+    The middle of a patch lies towards the stand that its plate merges with.
+    """
+    from scipy.spatial import cKDTree
+
+    on, beside = rays.uv[rays.is_on], rays.uv[~rays.is_on]
+    if len(beside) == 0:
+        return np.zeros(2)
+    on = on[thin(len(on), _FEW_RAYS)]
+    away_m, _ = cKDTree(beside).query(on)
+    deep = on[(away_m > min(half_m) / 2) & ((on**2).sum(axis=1) < np.hypot(*half_m) ** 2)]
+    return np.asarray(deep.mean(axis=0)) if len(deep) else np.zeros(2)
+
+
+def _from_all_angles(
+    rays: Rays, half_m: tuple[float, float], middle: Array, annealed_m: tuple[float, ...]
+) -> list[Placement]:
+    """Fit the rectangle from all angles about a point (2,), best first; `annealed_m` as of `fit_outline`."""
     radius_m = 1.25 * float(np.hypot(*half_m))
-    about = rays.select((rays.uv**2).sum(axis=1) < radius_m**2)
+    about = rays.select(((rays.uv - middle) ** 2).sum(axis=1) < radius_m**2)
     few = about.select(thin(len(about.uv), _FEW_RAYS))
     placements = []
     for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
-        start = Placement(0.0, 0.0, float(angle), half_m)
+        start = Placement(float(middle[0]), float(middle[1]), float(angle), half_m)
         fit = fit_outline(
-            few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), _WIDE_M
+            few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), annealed_m
         )
         if fit is not None:
             distance = fit.placement.distance_m(about.uv)
@@ -156,40 +184,43 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
             )
             share = float(misses / max(np.count_nonzero(on & (distance <= 0.02)), 1))
             placements.append(replace(fit.placement, error_m=share))
-    return sorted(placements, key=lambda placement: placement.error_m)[:2]
+    return sorted(placements, key=lambda placement: placement.error_m)
 
 
-def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> float:
-    """Measure how far the border is smeared along width or height, m: a blur beyond that of the beam.
-
-    A plate that moved in its plane while scans were accumulated has sharp edges nowhere.
+def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Array:
+    """Measure how far each side's border is smeared, m: its blur beyond that of the beam.
 
     Args:
         rays: about the plate.
         outline: fitted to them.
         blur_m: as of `fit_outline`.
+
+    Returns:
+        (4,) of the right, left, top and bottom side.
     """
     placement = outline.placement
     near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
     near = near.select(thin(len(near.uv), _SMEAR_RAYS))
     local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
-    beam_m = blur_m(placement.axes)
-    smears = []
-    for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0])):
-        ps = (_probability(local, half, np.hypot(beam_m, smear * axis))[0] for smear in _SMEARS_M)
-        smears.append(int(np.argmax([np.sum(np.log(np.where(near.is_on, p, 1 - p))) for p in ps])))
-    return float(_SMEARS_M[max(smears)])
+    beam_m = blur_m(placement.axes)[[0, 0, 1, 1]]
+    over = np.stack([local[:, 0], -local[:, 0], local[:, 1], -local[:, 1]]) - half[[0, 0, 1, 1], None]
+    nearest = over.argmax(axis=0)
+    log_p = []
+    for smear_m in _SMEARS_M:
+        p, _ = _probability(local, half, np.hypot(beam_m, smear_m))
+        log_p.append(np.bincount(nearest, np.log(np.where(near.is_on, p, 1 - p)), 4))
+    return np.asarray(_SMEARS_M[np.argmax(log_p, axis=0)])
 
 
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
     """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (4, M) by each distance s_e.
 
-    Sides are right, left, top and bottom.
+    Sides are right, left, top and bottom; `blur` is of each, or of the first and the last two alike.
     """
     from scipy.special import ndtr
 
     x, y = local.T
-    half, blur = half[[0, 0, 1, 1], None], blur[[0, 0, 1, 1], None]
+    half, blur = half[[0, 0, 1, 1], None], (blur if len(blur) == 4 else blur[[0, 0, 1, 1]])[:, None]
     z = (half - [x, -x, y, -y]) / blur
     factors = ndtr(z)
     inside = factors[0] * factors[1] * factors[2] * factors[3]
@@ -206,21 +237,24 @@ class Strips(NamedTuple):
         outwards: (K, 2) unit normals.
         off_m: (K,) by how much farther out they lie than the fitted outline.
         sigma_m: (K,) standard deviations.
+        side: (K,) of `measure_smears`.
     """
 
     uv: Array
     outwards: Array
     off_m: Array
     sigma_m: Array
+    side: Indices
 
 
-def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Strips:
+def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array], smears_m: Array) -> Strips:
     """Measure where each piece of the border lies, by the mean of its shift outwards under (1).
 
     Args:
         rays: about the plate.
         outline: fitted to them.
         blur_m: as of `fit_outline`.
+        smears_m: (4,) of the sides' borders, beyond that blur.
     """
     from scipy.special import ndtr
 
@@ -233,8 +267,8 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         n_strips = max(int(length / STRIP_M), 1)
         width = length / n_strips
         along = (local[:, 1 - axis] + length / 2) / width
-        blur = float(blur_m(axes[axis][None])[0])
-        for sign in (1.0, -1.0):
+        for side, sign in ((2 * axis, 1.0), (2 * axis + 1, -1.0)):
+            blur = float(np.hypot(blur_m(axes[axis][None])[0], smears_m[side]))
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
@@ -254,5 +288,6 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             at[:, axis], at[:, 1 - axis] = sign * (half[axis] + off), middle
             uv = at @ axes + [placement.u_m, placement.v_m]
             outwards = np.tile(sign * axes[axis], (n_strips, 1))
-            parts.append([each[is_seen] for each in (uv, outwards, off, sigma_m)])
+            sides = np.full(n_strips, side)
+            parts.append([each[is_seen] for each in (uv, outwards, off, sigma_m, sides)])
     return Strips(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -15,6 +15,7 @@ CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one 
 N_ROUNDS = 2
 BLOCK = 32  # of centres, whose distances fit the cache
 MAX_PLATES = 10
+MIN_LONG = 4  # chords across the plate, fewest that locate it beside a stand
 MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
 
@@ -262,13 +263,32 @@ def _different(plates: Plates, candidates: Indices, board: Board) -> Indices:
 
 
 def screen_plates(
-    plates: Plates, ends: Array, board: Board, limit_m: float
+    plates: Plates, ends: Array, board: Board, limit_m: float, *, on_stand: bool = False
 ) -> list[tuple[Array, Array, Placement]]:
-    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
+    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first.
+
+    Args:
+        plates: K of them.
+        ends: (K, M, 2) as of `propose_plates`.
+        board: gives the rectangle.
+        limit_m: largest error of an outline.
+        on_stand: whether to leave out chords shorter than half the board's short side: what the plate stands
+            on, flush with it, is narrower than the plate and ends elsewhere.
+    """
     if len(plates.centre) == 0:
         return []
-    relative = ends - plates.centre[:, None]
-    placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
+    relative = (ends - plates.centre[:, None]) @ plane_axes(plates.plane[:, :3])
+    if on_stand:
+        # The first and the last return of each chord, in two runs.
+        for row in relative:
+            n = np.count_nonzero(~np.isnan(row[:, 0])) // 2
+            is_short = (
+                np.linalg.norm(row[n : 2 * n] - row[:n], axis=1) < min(board.width_m, board.height_m) / 2
+            )
+            if 0 < np.count_nonzero(is_short) <= n - MIN_LONG:
+                row[: 2 * n][np.tile(is_short, 2)] = np.nan
+                row[:] = row[np.argsort(np.isnan(row[:, 0]), kind="stable")]
+    placements = register_ends(relative, board)
     rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
     return [
         (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m

@@ -187,14 +187,17 @@ def find_lidar_boards(
     boards: list[LidarBoard] = []
     misses: list[Refusal] = []
     max_beyond = np.inf
-    for start in screen_plates(plates, ends, board, limits.template_m):
-        measured = measure_plate(ordered, scan, board, start, limits, max_beyond)
-        if isinstance(measured, Refusal):
-            misses.append(measured)
-        elif measured is not None:
-            boards.append(measured)
-            if measured.quality.n_rings >= CLEAR_RINGS and measured.quality.beyond_share < CLEAR_SHARE:
-                max_beyond = PATCH_SHARE
+    for on_stand in (False, True):
+        for start in screen_plates(plates, ends, board, limits.template_m, on_stand=on_stand):
+            measured = measure_plate(ordered, scan, board, start, limits, max_beyond)
+            if isinstance(measured, Refusal):
+                misses.append(measured)
+            elif measured is not None:
+                boards.append(measured)
+                if measured.quality.n_rings >= CLEAR_RINGS and measured.quality.beyond_share < CLEAR_SHARE:
+                    max_beyond = PATCH_SHARE
+        if boards:
+            break
     if boards:
         return distinct_boards(boards, board)
     return misses[0] if misses else no_plate(ordered, board, limits)
@@ -228,6 +231,11 @@ def measure_plate(
     view, placement = refined
     if placement.error_m > STANDARD.template_m:
         view, placement = _past_dark_squares(ordered, board, start, limits, max_beyond) or refined
+    if placement.error_m > limits.template_m:
+        # A border that something hides tells only that the plate goes on there.
+        view, placement = (
+            refine(ordered, *start, limits.template_m, max_beyond, may_be_hidden=True) or refined
+        )
     if placement.error_m > limits.template_m:
         return outline_misfit(view, placement, limits.template_m, limits.rms_m)
     measured = build_board(ordered, scan, board, view, placement, limits.beam)

@@ -32,6 +32,7 @@ class PlaneView:
         tolerance_m: returns within it lie on the plane.
         dark_m: longest way across a dark square whose beams return nothing, or weakly from too far; 0 where
             all squares return alike.
+        may_be_hidden: whether the border may lie farther out than where a ring ends behind another surface.
     """
 
     plane: Array
@@ -42,6 +43,7 @@ class PlaneView:
     height_m: Array
     tolerance_m: float
     dark_m: float = 0.0
+    may_be_hidden: bool = False
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
@@ -230,9 +232,11 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
     inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
     outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
+    # The border lies farther out than an end beyond which a dark square may lie, or that something hides.
     if view.dark_m:
-        # The border lies farther out than an end beyond which a dark square may lie.
         kind[: len(ends)][_is_before_dark(scan, view, first, last)] = INSIDE
+    if view.may_be_hidden:
+        kind[: len(ends)][_is_before_cover(scan, view, first, last)] = INSIDE
     return np.concatenate([ends, inside, outside]), kind
 
 
@@ -250,12 +254,27 @@ def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> 
 
 def _is_before_dark(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
     """Tell beyond which ends (2 C,) of chords the ring goes on, but not with a beam that passes by."""
+    end, beyond, is_next = _beyond(scan, view, first, last)
+    passes = view.is_behind[beyond] & is_next
+    return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
+
+
+def _is_before_cover(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
+    """Tell beyond which ends (2 C,) of chords the next beam returns from before the plane."""
+    end, beyond, is_next = _beyond(scan, view, first, last)
+    is_same = scan.ring[view.member[beyond]] == scan.ring[view.member[end]]
+    return np.asarray(is_same & is_next & (view.height_m[beyond] > view.tolerance_m))
+
+
+def _beyond(
+    scan: OrderedScan, view: PlaneView, first: Indices, last: Indices
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """List the ends (2 C,) of chords, the beams of the view after them, and whether these follow at once."""
     end = np.concatenate([first, last])
     beyond = np.clip(end + np.repeat([-1, 1], len(first)), 0, len(view.uv) - 1)
     turn = scan.azimuth[view.member[beyond]] - scan.azimuth[view.member[end]]
     turn = np.abs(np.mod(turn + np.pi, 2 * np.pi) - np.pi)
-    passes = view.is_behind[beyond] & (turn <= MAX_STEPS * scan.step_rad)
-    return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
+    return end, beyond, turn <= MAX_STEPS * scan.step_rad
 
 
 def register_ends(ends: Array, board: Board) -> list[Placement]:

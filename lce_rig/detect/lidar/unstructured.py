@@ -11,13 +11,11 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.findings import (
-    LIDAR_HIDDEN,
+    LIDAR_MOVED,
     LIDAR_NO_BORDER,
     LIDAR_NO_RETURNS,
     LIDAR_OUT_OF_VIEW,
-    LIDAR_SMEARED,
     LIDAR_TOO_FEW_POINTS,
-    LIDAR_TOUCHING,
     LIDAR_TURNED,
 )
 from lce_rig.detect.lidar.measurement import Beam, fit_plane_to_ranges, median
@@ -27,7 +25,7 @@ from lce_rig.detect.lidar.outline import (
     Rays,
     Strips,
     fit_outline,
-    measure_smear,
+    measure_smears,
     measure_strips,
     register_rays,
     thin,
@@ -35,7 +33,6 @@ from lce_rig.detect.lidar.outline import (
 from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
     STANDARD,
-    TOUCHING_SHARE,
     Limits,
     board_at,
     distinct_boards,
@@ -62,10 +59,9 @@ _SURROUND_M = 0.25
 _MIN_POINTS = 60
 # Directions of a rosette's beams err by about this much.
 _DIRECTION_RAD = 7e-4
-_HIDDEN_SHARE = 0.10
 # Share of the plate without any return from which it reaches out of the field of view.
 _DARK_SHARE = 0.08
-_BEHIND_M, _HIDES_M, _FOOT_M = 0.05, 0.08, 0.15
+_BEHIND_M, _FOOT_M = 0.05, 0.15
 # Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
 # Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
@@ -73,9 +69,13 @@ _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
+# Rays farther beyond a located border should pass the plate.
+_CLEAR_M = 0.015
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
-# Of boards that stood still, 5 mm at most on recordings.
+# Of boards that stood still, 5 mm at most on recordings; wider borders count by their width.
 _MOST_SMEAR_M = 0.008
+# Parts, in order of time, whose places tell whether a plate moved; their chi2 of 6 freedoms, p = 1e-4.
+_N_PARTS, _MOVED_CHI2 = 4, 27.9
 # Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
 
@@ -359,7 +359,6 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     margin_m = 0.02 + float(outline.growth_m.max())
     deep = away < -margin_m
     beyond = float(np.count_nonzero(view.is_on & (away > margin_m) & (away < 0.15))) / max(n_on, 1)
-    hidden = float(np.mean(np.abs(view.height_m[deep]) > _HIDES_M)) if deep.any() else 1.0
     dark, cell_m = _empty_places(view.uv, placement, n_on)
     # A cell at the rim is dark only if its neighbours are: count what they hide of it.
     n_dark = np.count_nonzero(placement.distance_m(dark) < 0)
@@ -373,17 +372,19 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         return too_thick(sheet, _MOST_THICK_M)
     if dark_share > _DARK_SHARE:
         return LIDAR_OUT_OF_VIEW.refusal(distance_m=distance_m, share=float(dark_share))
-    if beyond > TOUCHING_SHARE:
-        return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
-    if hidden > _HIDDEN_SHARE:
-        return LIDAR_HIDDEN.refusal(distance_m=distance_m, hidden_share=hidden)
     rays = view.rays(placement.half_m, placement)
-    smear_m = measure_smear(rays, outline, view.blur_m)
-    if smear_m > _MOST_SMEAR_M:
-        return LIDAR_SMEARED.refusal(distance_m=distance_m, smear_m=smear_m, max_smear_m=_MOST_SMEAR_M)
-    strips = measure_strips(rays, outline, view.blur_m)
+    strips = measure_strips(rays, outline, view.blur_m, np.zeros(4))
+    is_touched, *_ = _look_beyond(view, strips, placement)
+    smears_m = measure_smears(_beside(rays, strips, is_touched), outline, view.blur_m)
+    smears_m[smears_m <= _MOST_SMEAR_M] = 0.0
+    if smears_m.any():
+        moved_m = _measure_motion(view, outline, smears_m)
+        if moved_m is not None:
+            return LIDAR_MOVED.refusal(distance_m=distance_m, moved_m=moved_m)
+        strips = measure_strips(rays, outline, view.blur_m, smears_m)
     # A strip that lies elsewhere than its neighbours shows what touches the border, or hides it.
-    is_good = (strips.sigma_m < _STRIP_SIGMA_M) & (
+    strip_smear_m = smears_m[strips.side]
+    is_good = (strips.sigma_m < np.hypot(_STRIP_SIGMA_M, strip_smear_m)) & (
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
     is_touched, behind_m, echo = _look_beyond(view, strips, placement)
@@ -421,6 +422,9 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     beam_m = view.beam_parts_m(strips.outwards, strips.uv)
     inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
+    # All strips of a side may err alike: together they count as one place, as well known as it is wide.
+    n_of_side = np.bincount(strips.side[is_good], minlength=4)[strips.side[is_good]]
+    edge_sigma_m = strip_smear_m[is_good] * np.sqrt(n_of_side)
     return LidarBoard(
         points=points,
         ring=np.full(len(points), NO_RING, dtype=np.int16),
@@ -435,7 +439,57 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         sigma_m=point_sigma_m,
         T_lidar_board=view.pose_of(placement),
         quality=quality,
+        edge_sigma_m=edge_sigma_m if edge_sigma_m.any() else None,
     )
+
+
+def _beside(rays: Rays, strips: Strips, is_touched: NDArray[np.bool_]) -> Rays:
+    """Leave out the rays to which a strip of the border (K,) that is touched is the nearest."""
+    from scipy.spatial import cKDTree
+
+    if not is_touched.any():
+        return rays
+    return rays.select(~is_touched[cKDTree(strips.uv).query(rays.uv)[1]])
+
+
+def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | None:
+    """Measure how far the plate moved in its plane while points were accumulated, m; None if it did not.
+
+    Points come in order of time: the outline is fitted to the rays of each quarter.
+
+    Args:
+        view: of the plate.
+        outline: fitted to all rays.
+        smears_m: (4,) of its sides.
+    """
+    placement = outline.placement
+    smear_m = float(smears_m.max())
+    growth = (outline.growth_m, 1e-3)
+    places, covs = [], []
+    for rows in np.array_split(np.arange(len(view.uv)), _N_PARTS):
+        part = replace(
+            view,
+            member=view.member[rows],
+            uv=view.uv[rows],
+            height_m=view.height_m[rows],
+            returns=view.returns[rows],
+        )
+        fit = fit_outline(
+            part.rays(placement.half_m, placement),
+            placement,
+            lambda axes: np.hypot(view.blur_m(axes), smear_m),
+            growth,
+        )
+        if fit is not None:
+            places.append([fit.placement.u_m, fit.placement.v_m])
+            covs.append(fit.cov[:2, :2])
+    if len(places) < _N_PARTS:
+        return None
+    away = np.array(places) - np.mean(places, axis=0)
+    chi2 = float(np.einsum("ki,kij,kj", away, np.linalg.inv(covs), away))
+    if chi2 < _MOVED_CHI2:
+        return None
+    return float(np.linalg.norm(np.ptp(places, axis=0)))
 
 
 def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDArray[np.bool_], Array, Array]:
@@ -455,7 +509,11 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
     beyond = strips.uv + strips.outwards * STRIP_M / 2
     for k, members in enumerate(cKDTree(view.uv).query_ball_point(beyond, STRIP_M / 2)):
         height_m = view.height_m[members]
-        is_touched[k] = np.count_nonzero(height_m > _FOOT_M) > _TOUCHED_SHARE * len(members)
+        # A plate ends where rays pass it. What stands before its border hides it; the floor, or a stand in
+        # its plane, leaves its border's place open.
+        is_clear = (view.uv[members] - strips.uv[k]) @ strips.outwards[k] > _CLEAR_M
+        is_there = height_m > -max(view.tolerance_m, _BEHIND_M)
+        is_touched[k] = np.count_nonzero(is_there & is_clear) > _TOUCHED_SHARE * np.count_nonzero(is_clear)
         is_behind = height_m < -max(view.tolerance_m, _BEHIND_M)
         if np.count_nonzero(is_behind) > _TOUCHED_SHARE * len(members):
             behind_m[k] = -median(height_m[is_behind])

@@ -218,7 +218,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     return np.concatenate(rows), block_diag(*noise)
 
 
-EDGE_FIELDS = ("group", "rows", "step_m", "range_m", "is_backed")
+EDGE_FIELDS = ("group", "rows", "step_m", "range_m", "is_backed", "sigma_m")
 
 
 def without_ends(edges):
