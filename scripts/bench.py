@@ -54,7 +54,7 @@ PARTS: dict[str, tuple[str, Part]] = {
     ),
     "scene_estimate": (
         "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
-        lambda bench, a: bench(a.seeds or 100),
+        lambda bench, a: bench(a.seeds or 100, a.only),
     ),
     "lidars": (
         "other LiDARs, simulated: boards found, errors, time of a search",

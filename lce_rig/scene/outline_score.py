@@ -76,6 +76,7 @@ class OutlineScore:
         weight = np.concatenate([each.weight for each in outlines])
         self._weight = weight / max(weight.sum(), 1e-12)
         self._kind = np.concatenate([each.kind for each in outlines])
+        self._view = np.repeat(np.arange(len(views)), [len(each) for each in outlines])
         # Upright outlines and reflectivities of a view first, then its level outlines.
         counts = [(int(np.sum(each.kind != LEVEL)), int(np.sum(each.kind == LEVEL))) for each in outlines]
         ends = np.cumsum([0, *(count for pair in counts for count in pair)]).tolist()
@@ -110,6 +111,12 @@ class OutlineScore:
         slopes = self._intrinsics.differentiate(np.where(is_valid[:, None], at_camera, [0.0, 0.0, 1.0]))
         return np.asarray(slopes)
 
+    def value(self, tangent: Array) -> float:
+        """Score extrinsics moved by a tangent (6,)."""
+        pixels, _ = self._intrinsics.project(transform(perturb(self.T_cam_lidar, tangent), self._points))
+        sampled = [layer.sample(pixels[chosen])[:, 0] for layer, chosen in self._layers]
+        return float(self._weight @ np.concatenate(sampled))
+
     def score(self, tangent: Array) -> tuple[float, Array]:
         """Score extrinsics moved by a tangent (6,), with the derivative (6,) by that tangent."""
         shares, slopes, _ = self.edges(tangent)
@@ -117,6 +124,13 @@ class OutlineScore:
         # exp((phi + dphi)^) = exp((J dphi)^) exp(phi^), J = I + phi^ / 2 up to terms of second order.
         left = np.eye(3) + skew(tangent[3:]) / 2
         return float(shares.sum()), np.concatenate([slope[:3], left.T @ slope[3:]])
+
+    def of_matching_views(self, tangent: Array) -> float:
+        """Score extrinsics by the views that match better than by chance: the others say nothing."""
+        shares, _, _ = self.edges(tangent)
+        total, weight = (np.bincount(self._view, each) for each in (shares, self._weight))
+        matches = total > 0
+        return float(total[matches].sum() / weight[matches].sum()) if matches.any() else 0.0
 
     def blocks(self, pixels: Array) -> NDArray[np.intp]:
         """Return the block (N,) of each edge: its kind and its part of the image, the same in all views.

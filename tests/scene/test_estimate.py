@@ -10,7 +10,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import NO_RING, Image, Scan
 from lce_rig.core.geometry import Array, difference, invert, perturb, pose, tangent_sizes
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.edge_pyramid import EdgePyramid
+from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
 from lce_rig.scene.estimate import REACH, estimate_scene
 from lce_rig.scene.outline_score import OutlineScore, build_outline_view
 from lce_rig.scene.outlines import LEVEL, UPRIGHT, find_outlines
@@ -104,6 +104,13 @@ def test_estimate_blind_view_has_no_veto(views):
     expected, found = estimate(views[1:]), estimate([blind, *views[1:]])
     assert found.state == expected.state and found.n_views == 2
     np.testing.assert_allclose(found.T_cam_lidar, expected.T_cam_lidar)
+
+
+def test_estimate_dark_views_have_no_veto(views):
+    grey = np.random.default_rng(0).normal(10, 2, (360, 640)).astype(np.uint8)
+    dark = build_edge_pyramid(grey, LENS.fx_px)
+    found = estimate([views[0], *[replace(view, pyramid=dark) for view in views]])
+    assert found.state == "usable" and found.chi2(TRUTH) < 16.81
 
 
 def test_estimate_mirrored_images_is_not_usable(views):
