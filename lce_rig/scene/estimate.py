@@ -26,16 +26,15 @@ _SEARCH_EDGES = 3000  # on all but the finest fields
 _SAME = 0.5  # Distance in units under which two maxima are one.
 _BEYOND = 1.5  # Largest distance from the start, in reaches
 
-# Chosen on KITTI's views 000000, 000741, ... 004448, alone and by two, three and five. Boards of rlfs01, rlfs02,
-# os1_64 and acfr_vlp16 agree: median chi-squared 1 to 6, where six degrees of freedom have 5.3.
+# Chosen on KITTI's views 000000, 000741, ... 004448, alone and by two, three and five. Boards of rlfs01,
+# rlfs02, os1_64 and acfr_vlp16 agree: median chi-squared 1 to 6, where six degrees of freedom have 5.3.
 _INFLATION = 2.0  # of standard deviations: neighbouring blocks share surfaces
 _BIAS = np.array([0.01, 0.01, 0.02, *np.radians([0.03, 0.03, 0.06])])
 """Standard deviation of errors that all edges of a scene share: beam width, lens, time. m, rad."""
-_LEAST_CURVATURE = 1e-3  # of the largest: flatter directions are left to the reach
-_PRIOR_REACH = 1.0  # Standard deviation of the start, in reaches.
+_LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
 
 _MIN_EDGES = 60
-_MIN_SCORE = 0.10  # Images and scans that do not belong together reach 0.06 in one view, 0 in three.
+_MIN_SCORE = 0.10  # Images and scans that do not belong together reach 0.06.
 _MIN_GAIN = 2.0  # Significance over another maximum
 _EXCLUDED_CHI2 = 16.81  # 99 % of six degrees of freedom: a maximum nearer by is no other one
 # Non-centrality of a chi-squared of six degrees of freedom that exceeds 16.81 in 95 % of the cases.
@@ -208,5 +207,5 @@ def _covariance(score: OutlineScore, tangent: Array, reach: Array) -> Array:
     small_sample = len(by_block) / max(len(by_block) - 6, 1)
     sandwich = inverse @ (by_block.T @ by_block) @ inverse * small_sample * scale
     cov = _INFLATION**2 * sandwich + np.diag(_BIAS**2)
-    limited = np.linalg.inv(np.linalg.inv(cov) + np.diag(1 / (_PRIOR_REACH * reach) ** 2))
+    limited = np.linalg.inv(np.linalg.inv(cov) + np.diag(1 / reach**2))
     return np.asarray((limited + limited.T) / 2)
