@@ -53,6 +53,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "the same for KITTI's clouds and a simulated Mid-360",
         lambda bench, a: bench(a.seeds or 20, a.only),
     ),
+    "scene_estimate": (
+        "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
+        lambda bench, a: bench(a.seeds or 100, a.only),
+    ),
     "lidars": (
         "other LiDARs, simulated: boards found, errors, time of a search",
         lambda bench, a: bench(a.captures or 20, a.output, a.only),

@@ -1,0 +1,133 @@
+"""Image edges as smooth fields of several widths, upright and level edges apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+SIGMAS_RAD = (0.024, 0.012, 0.006, 0.003)
+"""Blur of the fields: 1.4 deg, the error of rough extrinsics, down to the width of an outline."""
+
+_WORKING_FOCAL_PX = 1000.0  # Images of a longer focal length are halved first.
+_WEAKEST_GREY = 2.0  # Gradient of noise: an image without stronger edges has none.
+_CLIP_PERCENTILE = 99  # of gradients: stronger edges count no more
+_WINDOW_RAD, _WINDOW_SIGMAS = 0.12, 20.0  # Window across an edge, at least, and in sigmas of the blur,
+_WINDOW_ASPECT = 4  # by its length along the edge.
+_FLOOR = 0.005  # of the mean edge strength in a window, as a share of the strongest
+_OUTLIERS = 0.5  # Share of outlines without an image edge.
+_SAMPLES_PER_SIGMA = 1.5  # Coarse fields are stored at a lower resolution.
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeLayer:
+    """The field of edges of one direction at one width.
+
+    Attributes:
+        values: (H, W, 3) float32: log-likelihood ratio of an outline at a pixel against anywhere near, and
+            its derivatives along columns and rows, 1/px of the image.
+        reduction: pixels of the image to one of the field.
+    """
+
+    values: NDArray[np.float32]
+    reduction: int
+
+    def sample(self, pixels: Array) -> Array:
+        """Interpolate value and derivatives (N, 3) at pixels (N, 2) of the image; 0 outside."""
+        if not len(pixels):
+            return np.zeros((0, 3))
+        at = ((np.where(np.isfinite(pixels), pixels, -1e4) + 0.5) / self.reduction - 0.5).astype(np.float32)
+        at = np.clip(at, -1e4, 3e4)
+        rows = max(1, -(-len(at) // _REMAP_COLUMNS))
+        padded = np.full((rows * _REMAP_COLUMNS, 2), -1e4, dtype=np.float32)
+        padded[: len(at)] = at
+        grid = padded.reshape(rows, _REMAP_COLUMNS, 2)
+        sampled = cv2.remap(self.values, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderValue=(0.0,) * 4)
+        return np.asarray(sampled.reshape(-1, 3)[: len(at)], dtype=np.float64)
+
+
+_REMAP_COLUMNS = 1024  # OpenCV limits a row of samples to 32767.
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePyramid:
+    """The fields of one image.
+
+    Attributes:
+        levels: one pair (upright edges, level edges) for each of SIGMAS_RAD.
+    """
+
+    levels: Sequence[tuple[EdgeLayer, EdgeLayer]]
+
+
+def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
+    """Turn an image into fields of its upright and its level edges.
+
+    Gradients g are clipped, blurred and compared with their mean over a window, so that busy texture attracts
+    nothing: ln(0.5 + 0.5 g / mean g), half of the outlines being without an image edge.
+
+    Args:
+        grey: (H, W) image.
+        focal_px: of its lens.
+    """
+    reduction = 1
+    while focal_px / reduction > _WORKING_FOCAL_PX:
+        reduction *= 2
+    strengths = _edge_strengths(_reduced(grey.astype(np.float32), reduction))
+    levels = []
+    for sigma_rad in SIGMAS_RAD:
+        further = 1
+        while sigma_rad * focal_px / reduction / further > 2 * _SAMPLES_PER_SIGMA:
+            further *= 2
+        upright, level = (
+            EdgeLayer(
+                _field(_reduced(each, further), axis, sigma_rad, focal_px, reduction * further),
+                reduction * further,
+            )
+            for axis, each in enumerate(strengths)
+        )
+        levels.append((upright, level))
+    return EdgePyramid(tuple(levels))
+
+
+def _reduced(values: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Average blocks of pixels; the last ones are repeated to fill the blocks."""
+    if factor == 1:
+        return values
+    bottom, right = (-size % factor for size in values.shape)
+    padded = cv2.copyMakeBorder(values, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+    size = (padded.shape[1] // factor, padded.shape[0] // factor)
+    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _edge_strengths(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Compute clipped gradients along columns and along rows, 0 to 1."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    strengths = []
+    for axis in (0, 1):
+        gradient = np.abs(cv2.Scharr(smooth, cv2.CV_32F, 1 - axis, axis)) / 16
+        strongest = max(float(np.percentile(gradient, _CLIP_PERCENTILE)), _WEAKEST_GREY)
+        strengths.append(np.asarray(np.minimum(gradient / strongest, 1.0), dtype=np.float32))
+    return strengths[0], strengths[1]
+
+
+def _field(
+    strength: NDArray[np.float32], axis: int, sigma_rad: float, focal_px: float, reduction: int
+) -> NDArray[np.float32]:
+    """Blur edges, compare them with their mean over a window, and differentiate."""
+    px_per_rad = focal_px / reduction
+    across, along = sigma_rad * px_per_rad, max(0.5, sigma_rad * px_per_rad / 2)
+    wide = max(_WINDOW_RAD, _WINDOW_SIGMAS * sigma_rad) * px_per_rad
+    window = (int(wide) | 1, int(wide / _WINDOW_ASPECT) | 1)
+    if axis == 0:
+        blurred = cv2.GaussianBlur(strength, (0, 0), sigmaX=across, sigmaY=along)
+    else:
+        blurred = cv2.GaussianBlur(strength, (0, 0), sigmaX=along, sigmaY=across)
+        window = window[::-1]
+    ratio = (blurred + _FLOOR) / (cv2.blur(blurred, window) + _FLOOR)
+    values = np.log(_OUTLIERS + (1 - _OUTLIERS) * ratio).astype(np.float32)
+    slopes = [cv2.Sobel(values, cv2.CV_32F, 1 - k, k) / (8 * reduction) for k in (0, 1)]
+    return np.dstack([values, *slopes]).astype(np.float32)

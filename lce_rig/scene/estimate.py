@@ -1,0 +1,211 @@
+"""Extrinsics from the edges of a scene, without a board: one estimate of all six axes, with a covariance."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.core.calibration import MOTIONS
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.scene.edge_pyramid import SIGMAS_RAD
+from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
+
+EstimateState = Literal["usable", "few_edges", "beyond_reach", "ambiguous", "weak"]
+"""Usable, or the reason why not: too few edges; a maximum at the border of the region searched; another
+maximum of nearly the same score; a score no higher than of images and scans that do not belong together."""
+
+REACH = np.array([0.2, 0.2, 0.2, *np.radians([2.0, 2.0, 2.0])])
+"""Region searched about the start by default, m and rad."""
+
+_UNITS = np.array([0.05, 0.05, 0.05, *np.radians([0.5, 0.5, 0.5])])  # Steps of like effect, for the search.
+# Random starts at each width of the fields, coarse to fine, and maxima that go on from it.
+_N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
+_SEARCH_EDGES = 3000  # on all but the finest fields
+_SAME = 0.5  # Distance in units under which two maxima are one.
+_BEYOND = 1.5  # Largest distance from the start, in reaches
+
+# Chosen on KITTI's views 000000, 000741, ... 004448, alone and by two, three and five. Boards of rlfs01,
+# rlfs02, os1_64 and acfr_vlp16 agree: median chi-squared 1 to 6, where six degrees of freedom have 5.3.
+_INFLATION = 2.0  # of standard deviations: neighbouring blocks share surfaces
+_BIAS = np.array([0.01, 0.01, 0.02, *np.radians([0.03, 0.03, 0.06])])
+"""Standard deviation of errors that all edges of a scene share: beam width, lens, time. m, rad."""
+_LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
+
+_MIN_EDGES = 60
+_MIN_SCORE = 0.10  # Images and scans that do not belong together reach 0.06.
+_MIN_GAIN = 2.0  # Significance over another maximum
+_EXCLUDED_CHI2 = 16.81  # 99 % of six degrees of freedom: a maximum nearer by is no other one
+# Non-centrality of a chi-squared of six degrees of freedom that exceeds 16.81 in 95 % of the cases.
+_NOTICED = 27.04
+_CONTROL_SIGMAS = 3.0  # Extrinsics moved so far must score less.
+_UNDETERMINED = 0.5  # Standard deviation of a direction that the scene does not determine, in reaches.
+
+
+@dataclass(frozen=True, eq=False)
+class SceneEstimate:
+    """Extrinsics that the edges of a scene support.
+
+    Attributes:
+        T_cam_lidar: (4, 4).
+        cov: (6, 6) of the tangent (translation m, rotation rad).
+        state: whether it is usable, or why not.
+        score: mean log-likelihood ratio of an outline in the views that match; 0 where none does.
+        gain: significance of that over the next maximum; inf if there is none.
+        n_views, n_edges: compared.
+        reach: (6,) region searched, m and rad.
+    """
+
+    T_cam_lidar: Array
+    cov: Array
+    state: EstimateState
+    score: float
+    gain: float
+    n_views: int
+    n_edges: int
+    reach: Array
+
+    @property
+    def undetermined(self) -> tuple[tuple[str, ...], ...]:
+        """Directions that the scene does not determine, each by the names of its main axes."""
+        variances, directions = np.linalg.eigh(self.cov / np.outer(self.reach, self.reach))
+        wide = directions[:, variances > _UNDETERMINED**2].T
+        return tuple(tuple(np.array(MOTIONS)[each**2 > np.mean(each**2)].tolist()) for each in wide)
+
+    def chi2(self, T_cam_lidar: Array, cov: Array | None = None) -> float:
+        """Compare with extrinsics (4, 4) of a covariance (6, 6): chi-squared of six degrees of freedom."""
+        tangent = difference(T_cam_lidar, self.T_cam_lidar)
+        return float(tangent @ np.linalg.solve(self.cov if cov is None else self.cov + cov, tangent))
+
+    def smallest_changes(self, cov: Array) -> tuple[float, float]:
+        """Return the smallest rotation (deg) and translation (m), of any direction, that would be noticed.
+
+        Noticed is a chi-squared beyond 99 % of unchanged extrinsics, in 95 % of the cases.
+
+        Args:
+            cov: (6, 6) of the extrinsics compared.
+        """
+        information = np.linalg.inv(self.cov + cov)
+        parts = (information[3:, 3:], information[:3, :3])
+        turn, shift = (np.sqrt(_NOTICED / np.linalg.eigvalsh(part)[0]) for part in parts)
+        return float(np.degrees(turn)), float(shift)
+
+
+def estimate_scene(
+    views: Sequence[OutlineView], intrinsics: Intrinsics, T_start: Array, *, reach: Array = REACH
+) -> SceneEstimate:
+    """Estimate extrinsics from the edges of all views together.
+
+    The score is maximised from starts spread over the reach, on wide fields first. A view without edges, or
+    whose edges match nowhere, adds a constant: it has no veto.
+
+    Args:
+        views: of one drive or room.
+        intrinsics: of the camera.
+        T_start: (4, 4) rough extrinsics.
+        reach: (6,) largest error of each axis of the start, m and rad.
+    """
+    views = [view for view in views if len(view.outlines)]
+    n_edges = sum(len(view.outlines) for view in views)
+    if n_edges < _MIN_EDGES:
+        return SceneEstimate(T_start, np.diag(reach**2), "few_edges", 0.0, np.inf, len(views), n_edges, reach)
+    thinned = _thinned(views, -(-n_edges // _SEARCH_EDGES))
+    levels = [OutlineScore(thinned, intrinsics, T_start, level) for level in range(len(SIGMAS_RAD) - 1)]
+    finest = OutlineScore(views, intrinsics, T_start, len(SIGMAS_RAD) - 1)
+    maxima = _search([*levels, finest], reach)
+    best = maxima[0]
+    cov = _covariance(finest, best, reach)
+    score, gain = finest.of_matching_views(best), _gain(finest, best, maxima[1:], cov)
+    value = finest.value(best)
+    state: EstimateState = "usable"
+    if score < _MIN_SCORE or any(finest.value(each) >= value for each in _controls(best, cov)):
+        state = "weak"
+    elif np.any(np.abs(best) > 0.99 * _BEYOND * reach):
+        state = "beyond_reach"
+    elif gain < _MIN_GAIN:
+        state = "ambiguous"
+    T = perturb(T_start, best)
+    return SceneEstimate(T, cov, state, score, gain, len(views), n_edges, reach)
+
+
+def _thinned(views: Sequence[OutlineView], step: int) -> list[OutlineView]:
+    """Keep every n-th edge of each view."""
+    return [
+        replace(view, outlines=view.outlines.select(np.arange(0, len(view.outlines), step))) for view in views
+    ]
+
+
+def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
+    """Find the maxima (6,) of the finest level, the highest first.
+
+    Each level adds starts of its own: of few edges, the wide fields may have their maximum elsewhere.
+    """
+    from scipy.optimize import minimize
+
+    units = np.minimum(_UNITS, reach)
+    bounds = [(-limit, limit) for limit in _BEYOND * reach / units]
+    rng = np.random.default_rng(0)
+    maxima = [np.zeros(6)]
+    for level, n_starts, n_kept in zip(levels, _N_STARTS, _N_KEPT, strict=True):
+        starts = rng.uniform(-1, 1, (n_starts, 6)) * reach
+        order = np.argsort([-level.value(start) for start in starts])
+        maxima += list(starts[order[:n_kept]])
+
+        def fall(x: Array, level: OutlineScore = level) -> tuple[float, Array]:
+            score, slope = level.score(x * units)
+            return -score, -slope * units
+
+        climbed = [
+            minimize(fall, start / units, jac=True, method="L-BFGS-B", bounds=bounds) for start in maxima
+        ]
+        climbed.sort(key=lambda result: float(result.fun))
+        distinct: list[Array] = []
+        for result in climbed:
+            if all(np.linalg.norm(result.x - other) > _SAME for other in distinct):
+                distinct.append(np.asarray(result.x))
+        maxima = [x * units for x in distinct[:n_kept]]
+    return maxima
+
+
+def _gain(score: OutlineScore, best: Array, others: Sequence[Array], cov: Array) -> float:
+    """Compute the least significance, by blocks, of the maximum over others that its covariance excludes."""
+    shares, _, pixels = score.edges(best)
+    block, least = score.blocks(pixels), np.inf
+    for other in others:
+        if (other - best) @ np.linalg.solve(cov, other - best) > _EXCLUDED_CHI2:
+            gains = np.bincount(block, shares - score.edges(other)[0], N_BLOCKS)
+            least = min(least, float(gains.sum() / max(np.linalg.norm(gains), 1e-12)))
+    return least
+
+
+def _controls(best: Array, cov: Array) -> list[Array]:
+    """Move the maximum along the eigen-directions of its covariance, to both sides."""
+    variances, directions = np.linalg.eigh(cov / np.outer(_UNITS, _UNITS))
+    steps = _CONTROL_SIGMAS * _UNITS[:, None] * directions * np.sqrt(variances)
+    return [best + sign * step for step in steps.T for sign in (1, -1)]
+
+
+def _covariance(score: OutlineScore, tangent: Array, reach: Array) -> Array:
+    """Estimate the covariance (6, 6) of a maximum from the scatter of the blocks' slopes.
+
+    C = H^-1 J H^-1 with the curvature H of the score and J the sum of the squared slopes of the blocks, plus
+    the bias that blocks share; the reach limits what the scene does not determine.
+    """
+    curvature = np.empty((6, 6))
+    for axis, step in enumerate(_UNITS / 10):
+        either = [score.score(tangent + sign * step * np.eye(6)[axis])[1] for sign in (1, -1)]
+        curvature[axis] = -(either[0] - either[1]) / (2 * step)
+    scale = np.outer(_UNITS, _UNITS)
+    values, directions = np.linalg.eigh((curvature + curvature.T) / 2 * scale)
+    least = max(_LEAST_CURVATURE * values[-1], 1e-9)
+    inverse = directions / np.maximum(values, least) @ directions.T
+    _, slopes, pixels = score.edges(tangent)
+    block = score.blocks(pixels)
+    by_block = np.stack([np.bincount(block, column, N_BLOCKS) for column in (slopes * _UNITS).T], axis=1)
+    by_block = by_block[np.unique(block)]
+    small_sample = len(by_block) / max(len(by_block) - 6, 1)
+    sandwich = inverse @ (by_block.T @ by_block) @ inverse * small_sample * scale
+    cov = _INFLATION**2 * sandwich + np.diag(_BIAS**2)
+    limited = np.linalg.inv(np.linalg.inv(cov) + np.diag(1 / reach**2))
+    return np.asarray((limited + limited.T) / 2)

@@ -1,0 +1,146 @@
+"""Score of extrinsics: the fields of image edges at the projected outlines, with derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, perturb, skew, transform
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
+from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outlines
+
+_BESIDE_RAD = 0.06  # Margin of the image in which outlines are kept: other extrinsics bring them in.
+_NEAREST_M = 0.5  # in front of the camera
+_MAX_EDGES = 4000  # of one view; more add time and, of one view, hardly any information
+_COLUMNS, _ROWS = 8, 3  # Blocks of the image
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineView:
+    """Edges of one scan and of one image of the same scene.
+
+    Attributes:
+        capture: its name.
+        outlines: of the scan, near the image.
+        pyramid: fields of the image's edges.
+    """
+
+    capture: str
+    outlines: Outlines
+    pyramid: EdgePyramid
+
+
+def build_outline_view(
+    capture: str, image: Image, scan: Scan, beam: Beam, intrinsics: Intrinsics, T_cam_lidar: Array
+) -> OutlineView:
+    """Find the edges of a scan near the image, and those of the image.
+
+    Args:
+        capture: name of the view.
+        image: of the camera.
+        scan: of the LiDAR.
+        beam: of the LiDAR.
+        intrinsics: of the camera.
+        T_cam_lidar: (4, 4) rough extrinsics, within a few degrees.
+    """
+    at_camera = transform(T_cam_lidar, scan.points)
+    pixels, _ = intrinsics.project(at_camera)
+    near = (at_camera[:, 2] > _NEAREST_M) & intrinsics.is_inside(pixels, -_BESIDE_RAD * intrinsics.fx_px)
+    outlines = find_outlines(scan.points[near], scan.intensity[near], beam)
+    if len(outlines) > _MAX_EDGES:
+        outlines = outlines.select(np.linspace(0, len(outlines) - 1, _MAX_EDGES).round().astype(np.intp))
+    return OutlineView(capture, outlines, build_edge_pyramid(image.grey, intrinsics.fx_px))
+
+
+class OutlineScore:
+    """Mean log-likelihood ratio of the outlines of all views under extrinsics, at one width of the fields.
+
+    Args:
+        views: at least one with an outline.
+        intrinsics: of the camera.
+        T_cam_lidar: (4, 4) that tangents start from.
+        level: index of SIGMAS_RAD.
+    """
+
+    def __init__(
+        self, views: Sequence[OutlineView], intrinsics: Intrinsics, T_cam_lidar: Array, level: int
+    ) -> None:
+        self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
+        order = [np.argsort(view.outlines.kind == LEVEL, kind="stable") for view in views]
+        outlines = [view.outlines.select(each) for view, each in zip(views, order, strict=True)]
+        self._points = np.concatenate([each.points for each in outlines])
+        weight = np.concatenate([each.weight for each in outlines])
+        self._weight = weight / max(weight.sum(), 1e-12)
+        self._kind = np.concatenate([each.kind for each in outlines])
+        self._view = np.repeat(np.arange(len(views)), [len(each) for each in outlines])
+        # Upright outlines and reflectivities of a view first, then its level outlines.
+        counts = [(int(np.sum(each.kind != LEVEL)), int(np.sum(each.kind == LEVEL))) for each in outlines]
+        ends = np.cumsum([0, *(count for pair in counts for count in pair)]).tolist()
+        self._layers = [
+            (layer, slice(ends[2 * k + axis], ends[2 * k + axis + 1]))
+            for k, view in enumerate(views)
+            for axis, layer in enumerate(view.pyramid.levels[level])
+        ]
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def edges(self, tangent: Array) -> tuple[Array, Array, Array]:
+        """Score each edge under extrinsics moved by a tangent (6,).
+
+        Returns:
+            Shares (N,) of the score; their derivatives (N, 6) by a further tangent; pixels (N, 2).
+        """
+        T = perturb(self.T_cam_lidar, tangent)
+        at_camera = transform(T, self._points)
+        pixels, is_valid = self._intrinsics.project(at_camera)
+        sampled = np.empty((len(pixels), 3))
+        for layer, chosen in self._layers:
+            sampled[chosen] = layer.sample(pixels[chosen])
+        sampled[~is_valid] = 0.0
+        sampled *= self._weight[:, None]
+        by_point = np.einsum("ni,nij->nj", sampled[:, 1:], self._slopes(at_camera, is_valid))
+        by_turn = np.cross(at_camera - T[:3, 3], by_point)
+        return sampled[:, 0], np.concatenate([by_point, by_turn], axis=1), pixels
+
+    def _slopes(self, at_camera: Array, is_valid: NDArray[np.bool_]) -> Array:
+        slopes = self._intrinsics.differentiate(np.where(is_valid[:, None], at_camera, [0.0, 0.0, 1.0]))
+        return np.asarray(slopes)
+
+    def value(self, tangent: Array) -> float:
+        """Score extrinsics moved by a tangent (6,)."""
+        pixels, _ = self._intrinsics.project(transform(perturb(self.T_cam_lidar, tangent), self._points))
+        sampled = [layer.sample(pixels[chosen])[:, 0] for layer, chosen in self._layers]
+        return float(self._weight @ np.concatenate(sampled))
+
+    def score(self, tangent: Array) -> tuple[float, Array]:
+        """Score extrinsics moved by a tangent (6,), with the derivative (6,) by that tangent."""
+        shares, slopes, _ = self.edges(tangent)
+        slope = slopes.sum(axis=0)
+        # exp((phi + dphi)^) = exp((J dphi)^) exp(phi^), J = I + phi^ / 2 up to terms of second order.
+        left = np.eye(3) + skew(tangent[3:]) / 2
+        return float(shares.sum()), np.concatenate([slope[:3], left.T @ slope[3:]])
+
+    def of_matching_views(self, tangent: Array) -> float:
+        """Score extrinsics by the views that match better than by chance: the others say nothing."""
+        shares, _, _ = self.edges(tangent)
+        total, weight = (np.bincount(self._view, each) for each in (shares, self._weight))
+        matches = total > 0
+        return float(total[matches].sum() / weight[matches].sum()) if matches.any() else 0.0
+
+    def blocks(self, pixels: Array) -> NDArray[np.intp]:
+        """Return the block (N,) of each edge: its kind and its part of the image, the same in all views.
+
+        Views of one room show the same edges, so they are no blocks of their own.
+        """
+        width_px, height_px = self._intrinsics.width_px, self._intrinsics.height_px
+        at = np.nan_to_num(pixels / [width_px, height_px] * [_COLUMNS, _ROWS])
+        column, row = np.clip(at, 0, [_COLUMNS - 1, _ROWS - 1]).astype(np.intp).T
+        return np.asarray((self._kind * _COLUMNS + column) * _ROWS + row, dtype=np.intp)
+
+
+N_BLOCKS = len(KINDS_OF_EDGES) * _COLUMNS * _ROWS

@@ -1,0 +1,188 @@
+"""Extrinsics from a scene without a board, against the truth of rendered panels."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import NO_RING, Image, Scan
+from lce_rig.core.geometry import Array, difference, invert, perturb, pose, tangent_sizes
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
+from lce_rig.scene.estimate import REACH, estimate_scene
+from lce_rig.scene.outline_score import OutlineScore, build_outline_view
+from lce_rig.scene.outlines import LEVEL, UPRIGHT, find_outlines
+from tests.scene.conftest import COV
+
+LENS = Intrinsics(450.0, 450.0, 320.0, 180.0, 640, 360)
+BEAM = Beam(0.0, 0.0)
+AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+TRUTH = perturb(pose(AXES, np.zeros(3)), np.array([0.05, -0.2, 0.1, 0.02, -0.03, 0.01]))
+STEP = np.radians(0.25)
+
+
+class Panels(NamedTuple):
+    """Upright panels before a wall, across the x axis: corners (y, z) and distance in m, and grey."""
+
+    low: Array
+    high: Array
+    x: Array
+    grey: Array
+
+    def hit(self, origin, rays):
+        """Return distance and grey (N,) along rays (N, 3) from a point, frame lidar."""
+        distance, grey = np.full(len(rays), np.inf), np.zeros(len(rays))
+        for low, high, x, shade in zip(*self, strict=True):
+            along = (x - origin[0]) / rays[:, 0]
+            at = (origin + along[:, None] * rays)[:, 1:]
+            is_hit = (along > 0) & (along < distance) & np.all((at > low) & (at < high), axis=1)
+            distance[is_hit], grey[is_hit] = along[is_hit], shade
+        return distance, grey
+
+
+def panels(seed, n=12):
+    rng = np.random.default_rng(seed)
+    x = np.append(rng.uniform(3, 12, n), 20.0)
+    middle, size = rng.uniform(-1, 1, (n, 2)) * [0.55, 0.3] * x[:n, None], rng.uniform(0.3, 1.2, (n, 2))
+    low, high = np.vstack([middle - size, [-50, -50]]), np.vstack([middle + size, [50, 50]])
+    return Panels(low, high, x, np.append(rng.uniform(40, 220, n), 128.0))
+
+
+def outline_view(seed):
+    """Render one view of random panels at the true extrinsics, with noise."""
+    scene, rng = panels(seed), np.random.default_rng(seed)
+    angles = np.stack(np.meshgrid(np.arange(-0.7, 0.7, STEP), np.arange(-0.45, 0.45, STEP)), axis=-1)
+    azimuth, elevation = angles.reshape(-1, 2).T
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1)
+    distance, _ = scene.hit(np.zeros(3), rays)
+    points = rays * (distance + rng.normal(0, 0.01, len(rays)))[:, None]
+    scan = Scan(
+        "lidar", 0, points.astype(np.float32), np.zeros(len(points), np.float32), NO_RINGS[: len(points)]
+    )
+    pixels = np.stack(np.meshgrid(np.arange(640), np.arange(360)), axis=-1).reshape(-1, 2)
+    back = invert(TRUTH)
+    _, grey = scene.hit(back[:3, 3], LENS.unproject(pixels) @ back[:3, :3].T)
+    grey = np.clip(grey + rng.normal(0, 3, len(grey)), 0, 255).reshape(360, 640).astype(np.uint8)
+    return build_outline_view(str(seed), Image("cam", "frames", 0, grey), scan, BEAM, LENS, TRUTH)
+
+
+NO_RINGS = np.full(100_000, NO_RING, dtype=np.int16)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [outline_view(seed) for seed in range(3)]
+
+
+def estimate(views, tangent=(0.0,) * 6):
+    return estimate_scene(views, LENS, perturb(TRUTH, np.array(tangent)))
+
+
+STARTS = np.random.default_rng(5).uniform(-1, 1, (20, 6)) * REACH
+
+
+@pytest.mark.parametrize("start", STARTS[:4])
+def test_estimate_rough_start_covers_truth(views, start):
+    found = estimate(views, start)
+    assert found.state == "usable"
+    assert found.chi2(TRUTH) < 16.81
+    turn_deg, shift_m = tangent_sizes(difference(found.T_cam_lidar, TRUTH))
+    assert turn_deg < 0.1 and shift_m < 0.02
+
+
+@pytest.mark.long
+def test_estimate_one_view_claims_cover_errors():
+    found = [estimate([outline_view(10 + k)], start) for k, start in enumerate(STARTS)]
+    chi2 = np.array([each.chi2(TRUTH) for each in found if each.state == "usable"])
+    assert len(chi2) > 10 and np.mean(chi2 < 12.59) >= 0.9
+
+
+def test_estimate_blind_view_has_no_veto(views):
+    blind = replace(views[0], outlines=views[0].outlines.select(np.zeros(len(views[0].outlines), dtype=bool)))
+    expected, found = estimate(views[1:]), estimate([blind, *views[1:]])
+    assert found.state == expected.state and found.n_views == 2
+    np.testing.assert_allclose(found.T_cam_lidar, expected.T_cam_lidar)
+
+
+def test_estimate_dark_views_have_no_veto(views):
+    grey = np.random.default_rng(0).normal(10, 2, (360, 640)).astype(np.uint8)
+    dark = build_edge_pyramid(grey, LENS.fx_px)
+    found = estimate([views[0], *[replace(view, pyramid=dark) for view in views]])
+    assert found.state == "usable" and found.chi2(TRUTH) < 16.81
+
+
+def test_estimate_mirrored_images_is_not_usable(views):
+    def mirrored(view):
+        levels = [
+            tuple(replace(layer, values=layer.values[:, ::-1] * np.float32([1, -1, 1])) for layer in pair)
+            for pair in view.pyramid.levels
+        ]
+        return replace(view, pyramid=EdgePyramid(levels))
+
+    found = estimate([mirrored(view) for view in views])
+    assert found.state != "usable"
+
+
+def test_estimate_no_edges_is_few_edges(views):
+    empty = replace(views[0], outlines=views[0].outlines.select(np.zeros(len(views[0].outlines), dtype=bool)))
+    found = estimate([empty])
+    assert found.state == "few_edges"
+    assert len(found.undetermined) == 6
+
+
+def test_estimate_upright_edges_leave_pitch_wide(views):
+    upright = [replace(v, outlines=v.outlines.select(v.outlines.kind == UPRIGHT)) for v in views]
+    whole, part = estimate(views), estimate(upright)
+    assert part.cov[3, 3] > whole.cov[3, 3]
+
+
+def test_changes_beyond_the_smallest_exceed_chi2(views):
+    found, cov = estimate(views), COV
+    turn_deg, shift_m = found.smallest_changes(cov)
+    for axis in range(6):
+        step = (np.radians(turn_deg) if axis > 2 else shift_m) * np.eye(6)[axis]
+        assert found.chi2(perturb(found.T_cam_lidar, step), cov) > 16.81
+
+
+def test_score_slope_is_difference_quotient(views):
+    score = OutlineScore(views, LENS, TRUTH, 0)
+    tangent = np.array([0.02, -0.03, 0.01, 0.02, -0.01, 0.015])
+    _, slope = score.score(tangent)
+    step = 1e-3
+    numeric = [
+        (score.score(tangent + step * axis)[0] - score.score(tangent - step * axis)[0]) / (2 * step)
+        for axis in np.eye(6)
+    ]
+    np.testing.assert_allclose(slope, numeric, atol=0.1 * np.abs(numeric).max())
+
+
+def panel_before_wall(beam):
+    """A panel of 1 m at 4 m before a wall at 8 m, scanned in steps of 0.2 deg."""
+    azimuth, elevation = np.meshgrid(*[np.radians(np.arange(-15, 15, 0.2))] * 2)
+    rays = np.stack([np.ones_like(azimuth), np.tan(azimuth), np.tan(elevation) / np.cos(azimuth)], axis=-1)
+    is_panel = np.all(np.abs(rays[..., 1:] * 4) < 0.5, axis=-1)
+    points = np.where(is_panel, 4.0, 8.0)[..., None] * rays
+    return find_outlines(points.reshape(-1, 3), np.ones(points.size // 3), beam)
+
+
+def test_outlines_of_panel_lie_on_its_border():
+    found = panel_before_wall(Beam(0.0, 0.0))
+    for kind, axis in ((UPRIGHT, 1), (LEVEL, 2)):
+        border = np.abs(found.points[found.kind == kind, axis])
+        assert len(border) > 100
+        assert np.median(border) == pytest.approx(0.5, abs=0.008)
+    assert np.linalg.norm(found.points, axis=1).max() < 5.0
+
+
+def test_outlines_of_wide_beam_lie_within_last_return():
+    narrow, wide = panel_before_wall(Beam(0.0, 0.0)), panel_before_wall(Beam(0.0, 0.003))
+    shrunk = np.median(np.abs(narrow.points[narrow.kind == UPRIGHT, 1])) - np.median(
+        np.abs(wide.points[wide.kind == UPRIGHT, 1])
+    )
+    assert shrunk == pytest.approx(0.006, abs=0.002)
+
+
+def test_outlines_of_few_points_are_none():
+    assert len(find_outlines(np.ones((5, 3)), np.ones(5), Beam())) == 0
