@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
-from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
+from lce_rig.pipeline.findings import FEW_DETECTED, LIDAR_ABSENT, SHORTAGE, UNCONNECTED, few_detected
 from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
     find_named,
@@ -261,7 +261,40 @@ def calibrate_detections(
         others = [f for loop, f in loops if own.names in loop.pairs]
         others += [finding for names, finding in named if names == own.names]
         calibrations.append(judged_peers(rig, own, others))
+    if cameras is None and channels is None:
+        shortages += _unconnected(rig, detections, calibrations)
     return name_moved(calibrations), shortages
+
+
+def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:
+    """List LiDARs in no capture, and groups of sensors that no placement connects with the first one's.
+
+    The placement that would connect them is one before the two sensors that share the most captures already.
+    """
+    absent = [LIDAR_ABSENT(name) for name in rig.lidars if name not in detections.lidars]
+    held: dict[str, set[str]] = {name: set(found) for name, found in detections.lidars.items()}
+    for (camera, _), found in detections.images.items():
+        held.setdefault(camera, set()).update(found)
+    order = [name for name in (*rig.lidars, *rig.cameras) if name in held]
+    groups = _connected((c.camera, c.lidar) for c in calibrations)
+    names = [sorted({name for pair in group for name in pair}, key=order.index) for group in groups]
+    names += [[name] for name in order if not any(name in group for group in names)]
+    first, *others = sorted(names, key=lambda group: order.index(group[0]))
+    findings = []
+    for group in others:
+        near, far = max(product(first, group), key=lambda pair: len(held[pair[0]] & held[pair[1]]))
+        if held[near] & held[far]:
+            continue  # The pair's own shortage says what it lacks.
+        findings.append(
+            UNCONNECTED(
+                " and ".join(group),
+                others=" and ".join(first),
+                first=near,
+                second=far,
+                n_needed=rig.quality.min_captures,
+            )
+        )
+    return [*absent, *findings]
 
 
 def _pairs_by_sensors(

@@ -44,6 +44,16 @@ def few_detected(subject: str, n_detected: int, refused: Mapping[str, Refusal], 
     )
 
 
+UNCONNECTED = warning_kind(
+    "shortage.unconnected",
+    "no placement connects {subject} with {others}",
+    "hold the board in {n_needed} placements or more where both {first} and {second} see it",
+)
+LIDAR_ABSENT = warning_kind(
+    "shortage.lidar_absent",
+    "no capture holds a scan of {subject}",
+    "record it with the others, or remove it from the profile",
+)
 CHANNEL_ABSENT = warning_kind(
     "shortage.channel_absent",
     "no capture holds {subject}: the result is without it",

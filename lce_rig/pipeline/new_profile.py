@@ -114,7 +114,8 @@ def new_profile(
     scans = [topic for topic in topics if topic.kind == "scans"]
     groups = _by_camera([topic for topic in topics if topic.kind != "scans"])
     if recording is not None and not clouds:
-        for seen, what in ((scans, "point clouds"), (groups, "images or events")):
+        # Two cameras can be calibrated with each other alone.
+        for seen, what in ((scans or groups[1:], "point clouds"), (groups, "images or events")):
             if not seen:
                 listed = "; ".join([*map(_line, topics), *skipped])
                 raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", listed)
@@ -136,7 +137,7 @@ def new_profile(
             )
     model = lidar_model or _UNKNOWN_MODEL
     notes = [*map(_line, topics), *skipped]
-    if scans:
+    if scans or (recording is not None and not clouds):
         names = ["lidar"] if len(scans) == 1 else [f"lidar_{k + 1}" for k in range(len(scans))]
         lidars = {
             name: _lidar(name, model, notes, topic, topic.cloud, topic.topic)
