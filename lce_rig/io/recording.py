@@ -140,6 +140,8 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
     Raises:
         SourceError: the rig has no such LiDAR.
     """
+    if not rig.lidars:
+        raise SourceError(f"rig {rig.name!r} has no LiDAR", "Add it to the profile, or give images alone.")
     lidar = options.lidar or next(iter(rig.lidars))
     if lidar not in rig.lidars:
         raise SourceError(f"rig {rig.name!r} has no lidar {lidar!r}; it has {', '.join(rig.lidars)}")

@@ -57,6 +57,8 @@ def measure_lidar(
             offset of them all.
     """
     rig = sessions[0].rig
+    if not rig.lidars:
+        raise UsageError(f"{sessions[0].path}: the rig has no LiDAR to measure", "Give a session of one.")
     name = lidar or next(iter(rig.lidars))
     for session in sessions:
         if name not in session.rig.lidars:

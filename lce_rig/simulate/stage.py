@@ -188,7 +188,16 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
 
 
 def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:
-    """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR."""
+    """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR.
+
+    Raises:
+        ProfileError: the rig has no LiDAR.
+    """
+    if not rig.lidars:
+        raise ProfileError(
+            f"rig {rig.name}: without a LiDAR it cannot be simulated",
+            "Simulate its cameras beside a LiDAR, as in the rig two_cameras.",
+        )
     links: list[tuple[str, str, Array]] = []
     for index, entry in enumerate(rig.nominal_extrinsics):
         rng = np.random.default_rng([options.mounting_of(seed), OF_SESSION, TRUTH, index])

@@ -105,3 +105,18 @@ def test_lidar_in_no_capture_is_named():
     found = simulate(30, 0, sensors=("left", "front"), n_seeing=(2,))
     _, shortages = calibrate_detections(make_rig(), found)
     assert "no capture holds a scan of rear" in [each.text for each in shortages]
+
+
+@pytest.mark.slow
+def test_two_cameras_claims_cover_errors_of_many_sessions():
+    """60 sessions of 20 placements, with profiles that err as they state."""
+    chi2, sizes = [], []
+    for seed in range(60):
+        (c,), _ = calibrate_detections(*stereo(seed))
+        x = error(c)
+        chi2.append(x @ np.linalg.solve(c.cov, x))
+        sizes.append([np.degrees(np.linalg.norm(x[3:])), 1e3 * np.linalg.norm(x[:3])])
+    rms_deg, rms_mm = np.sqrt(np.mean(np.square(sizes), axis=0))
+    covered = np.mean(np.array(chi2) < 12.59)
+    print(f"rms {rms_deg:.3f} deg, {rms_mm:.1f} mm; {covered:.1%} within 95 %")
+    assert rms_deg < 0.03 and rms_mm < 6.0 and covered > 0.92
