@@ -69,6 +69,15 @@ class ExportJob:
         """The calibrations of a camera and a LiDAR."""
         return [c for c in self.calibrations if not c.is_of_peers]
 
+    @property
+    def by_camera(self) -> dict[str, Calibration]:
+        """A calibration of each camera, one with a LiDAR if there is any."""
+        found = {c.camera: c for c in self.of_cameras}
+        for c in self.calibrations:
+            for name in (c.camera, c.lidar) if c.is_of_cameras else ():
+                found.setdefault(name, c)
+        return found
+
     @cached_property
     def trees(self) -> list[RobotTree]:
         """The trees of frames in which outputs place the sensors."""

@@ -106,7 +106,7 @@ def export_mcap(job: ExportJob) -> list[Path]:
                 topics.write(f"{topic.rpartition('/')[0]}/camera_info", _INFO_TYPE, time_ns, info)
             for calibration in job.of_cameras:
                 _write_projected(topics, calibration, scans, images, time_ns, limits_m, job)
-    for name in dict.fromkeys(c.camera for c in job.of_cameras):
+    for name in job.by_camera:
         if name not in shown:
             job.findings.append(NO_IMAGES(name, format="mcap"))
     return sorted(folder.iterdir())

@@ -21,7 +21,7 @@ from lce_rig.session.durable import write_atomically
 def export_camera_info(job: ExportJob) -> list[Path]:
     """Write camera_info_CAMERA.yaml for ROS camera drivers."""
     paths = []
-    for name, calibration in {c.camera: c for c in job.of_cameras}.items():
+    for name, calibration in job.by_camera.items():
         path = job.folder / f"camera_info_{name}.yaml"
         head = job.head("camera_info", calibration, of_one_camera=True)
         write_atomically(path, camera_info_text(name, job.rig.cameras[name].to_intrinsics(), head))
