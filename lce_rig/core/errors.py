@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 from lce_rig.core.bounds import require_file
 from lce_rig.core.findings import Finding, Kind, Refusal, Stage
@@ -106,7 +107,8 @@ def reading(
     Devices, pipes and files that are too large are refused before they are opened.
 
     Libraries raise whatever their code meets in a damaged file: KeyError, struct.error, RuntimeError and
-    errors of their own. An LceRigError passes: it names its cause already.
+    errors of their own. An LceRigError passes: it names its cause already. So do errors that only a bug in
+    lce-rig can raise.
 
     Args:
         path: the file, or words for the message.
@@ -125,7 +127,28 @@ def reading(
     except OSError as error:
         raise kind(f"{path}: cannot be read: {reason_of(error)}") from error
     except Exception as error:
+        if _is_bug(error):
+            raise
         raise kind(f"{path}: {reason_of(error)}", hint) from error
+
+
+def _is_bug(error: Exception) -> bool:
+    """Check whether an error follows from the program, whatever a file holds."""
+    if isinstance(error, AttributeError):
+        # Values of files have types of Python and NumPy.
+        owner = error.obj if isinstance(error.obj, ModuleType | type) else type(error.obj)
+        home = owner.__name__ if isinstance(owner, ModuleType) else owner.__module__
+        return home.partition(".")[0] == __package__.partition(".")[0]
+    return isinstance(error, NameError | AssertionError) and _raised_here(error)
+
+
+def _raised_here(error: Exception) -> bool:
+    """Check whether code of this package raised an error, not a library's."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    name = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
+    return name.partition(".")[0] == __package__.partition(".")[0]
 
 
 def reason_of(error: Exception) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -189,10 +190,7 @@ def export(
     robot: RobotTree | None = None,
     findings: list[Finding] | None = None,
 ) -> list[Path]:
-    """Write formats into a folder.
-
-    Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
-    for this result.
+    """Write formats into a folder, in one step: those of an earlier run are removed when all are written.
 
     Args:
         calibrations: one for each camera and LiDAR.
@@ -210,7 +208,7 @@ def export(
     Raises:
         LceRigError: a calibration names sensors that the rig does not have.
         SessionError: the sensors do not fit into the robot's tree.
-        ResultRefusedError: a verdict is "fail", or a pose is not finite; nothing is written.
+        ResultRefusedError: a verdict is "fail", or a pose is not finite; nothing is written or removed.
     """
     folder = Path(folder)
     for calibration in calibrations:
@@ -220,18 +218,27 @@ def export(
                 f"the pose of {calibration.camera} and {calibration.lidar} is not finite"
             )
     exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
-    remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
     told = [] if findings is None else findings
-    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session, told)
-    paths: list[Path] = []
     try:
-        for exporter in exporters:
-            paths += exporter(job)
-    except BaseException:
+        folder.mkdir(parents=True, exist_ok=True)
+        holder = TemporaryDirectory(dir=folder, prefix=".draft-")
+    except OSError as error:
+        raise SessionError(f"{folder}: cannot be written: {error.strerror}") from error
+    with holder as name:
+        draft = Path(name)
+        job = ExportJob(calibrations, rig.with_lenses(calibrations), draft, robot, session, told)
+        paths = [path for exporter in exporters for path in exporter(job)]
         remove_exports(folder)
-        raise
-    return paths
+        for path in sorted(draft.iterdir()):
+            try:
+                path.replace(folder / path.name)
+            except OSError as error:
+                raise SessionError(
+                    f"{folder / path.name}: cannot be replaced: {error.strerror}",
+                    "Remove it, or choose another folder.",
+                ) from error
+    return [folder / path.relative_to(draft) for path in paths]
 
 
 def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:

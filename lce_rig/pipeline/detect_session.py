@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeVar, cast
 
+import cv2
 import numpy as np
 
 from lce_rig.calibrate.association import find_association_error
@@ -286,10 +287,12 @@ def _cache_key(digest: str, capture: Capture, sensor: str) -> str:
 
 
 def detection_digest(rig: Rig) -> str:
-    """Hash the inputs of a detection besides the capture, profile and code, to 12 digits."""
+    """Hash the inputs of a detection besides the capture, to 12 digits: profile, code and libraries."""
     digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
     package = Path(__file__).parents[1]
-    sources = [source for folder in ("core", "detect") for source in (package / folder).rglob("*.[jp]*[ny]")]
+    digest.update(f"{cv2.__version__} {np.__version__}".encode())
+    rooms = ("core", "detect", "rig")
+    sources = [source for folder in rooms for source in (package / folder).rglob("*.[jp]*[ny]")]
     for source in sorted([*sources, Path(__file__)]):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:12]

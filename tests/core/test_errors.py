@@ -39,3 +39,25 @@ def test_an_error_of_lce_rig_passes_unchanged():
     with pytest.raises(SessionError) as raised, reading(PATH, SourceError):
         raise error
     assert raised.value is error
+
+
+class _Ours:
+    pass
+
+
+_Ours.__module__ = "lce_rig.core.errors"
+
+
+@pytest.mark.parametrize(
+    ("broken", "raised"),
+    [
+        (lambda: _Ours().missing, AttributeError),
+        (lambda: [].get("key"), SourceError),
+        (lambda: {}["key"], SourceError),
+        (lambda: undefined, SourceError),  # noqa: F821  raised outside the package
+    ],
+    ids=["own attribute", "attribute of a list", "missing key", "name outside the package"],
+)
+def test_reading_passes_bugs_and_names_damaged_files(broken, raised):
+    with pytest.raises(raised), reading("file"):
+        broken()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import ResultRefusedError
 from lce_rig.core.geometry import perturb
-from lce_rig.export import EXPORTS, ExportJob, is_export, remove_exports, usual_formats
+from lce_rig.export import EXPORTS, ExportJob, export, is_export, remove_exports, usual_formats
 from lce_rig.export.coloured_cloud import coloured
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import OutputFormat
@@ -50,6 +51,17 @@ def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case, tmp_pa
     (folder / "scan.ply").write_bytes(b"ply\nformat ascii 1.0\n")
     remove_exports(folder)
     assert sorted(path.name for path in folder.iterdir()) == ["mine", "scan.ply"]
+
+
+def test_refused_export_leaves_earlier_files(case, tmp_path):
+    import shutil
+
+    folder = tmp_path / "out"
+    shutil.copytree(case.folder, folder)
+    before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    with pytest.raises(ResultRefusedError):
+        export([replace(case.calibration, verdict="fail")], case.rig, folder)
+    assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
 
 
 def test_the_profile_names_the_formats_that_are_written():
