@@ -6,22 +6,21 @@ calibrate, holds it for long.
 
 import os
 import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
-from types import ModuleType, TracebackType
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection, Pipe
+from types import TracebackType
 from typing import Any
 
 from lce_rig.core.errors import LceRigError, SourceError
 
 # One process already has two cores' worth of work: threads of its own would only wait for each other.
+# Libraries read the number when they are loaded.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _CLOSE_S = 2.0
-_starting = threading.Lock()
 
 
 class Worker:
@@ -40,7 +39,7 @@ class Worker:
             nice: added to the process's niceness.
         """
         self._name, self._made = name, (nice, make, arguments)
-        self._process: BaseProcess | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._is_closed = False
         self._lock = threading.Lock()
 
@@ -57,7 +56,10 @@ class Worker:
         self._is_closed, process = True, self._process
         if process is not None:
             process.terminate()
-            process.join(_CLOSE_S)
+            try:
+                process.wait(_CLOSE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
     def call(self, method: str, *arguments: object) -> Any:
         """Call a method of the object, and give what it returns.
@@ -74,7 +76,7 @@ class Worker:
                     answer = self._connection.recv()
                     break
                 except (EOFError, OSError):
-                    self._process = None
+                    self._forget()
             else:
                 raise SourceError(f"the process `{self._name}` ended", "Is memory short?")
         if isinstance(answer, BaseException):
@@ -85,50 +87,33 @@ class Worker:
         """Start a process that computes in one thread and that Ctrl-C does not reach: this one ends it."""
         if self._is_closed:
             raise SourceError(f"the process `{self._name}` was ended")
-        # A forked process would share locks of this one's threads.
-        context = get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, *self._made), name=self._name, daemon=True)
-        with _plain_surroundings():
-            process.start()
-        theirs.close()
-        self._process = process
+        self._connection, theirs = Pipe()
+        with theirs:
+            # A forked process would share locks of this one's threads.
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__, str(theirs.fileno())],
+                env={**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        self._connection.send(self._made)
+
+    def _forget(self) -> None:
+        """Collect a process that has ended."""
+        process, self._process = self._process, None
+        self._connection.close()
+        if process is not None:
+            process.wait()
 
 
-@contextmanager
-def _plain_surroundings() -> Iterator[None]:
-    """Let a process that starts now compute in one thread, and hide interrupts and the program from it.
-
-    Libraries read the number of threads when they are loaded. A script without a guard would run once more.
-    """
-    with _starting:
-        # Starting the tracker later would let interrupts through again.
-        resource_tracker.ensure_running()
-        masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        before, main = {name: os.environ.get(name) for name in _ONE_THREAD}, sys.modules["__main__"]
-        os.environ.update(_ONE_THREAD)
-        sys.modules["__main__"] = ModuleType("__main__")
-        try:
-            yield
-        finally:
-            sys.modules["__main__"] = main
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
-            signal.pthread_sigmask(signal.SIG_SETMASK, masked)
-
-
-def _serve(
-    connection: Connection, nice: int, make: Callable[..., object], arguments: tuple[object, ...]
-) -> None:
+def _serve(connection: Connection) -> None:
     """Answer calls until the other end is gone."""
     # The parent ends this; a closed terminal must not.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    os.nice(nice)
     subject: object = None
     try:
+        nice, make, arguments = connection.recv()
+        os.nice(nice)
         while True:
             method, values = connection.recv()
             answer: object
@@ -137,8 +122,12 @@ def _serve(
                 answer = getattr(subject, method)(*values)
             except LceRigError as error:
                 answer = error
-            except Exception as error:  # The caller learns of bugs as well.
-                answer = RuntimeError(f"{method}: {error!r}")
+            except Exception:  # The caller learns of bugs as well.
+                answer = RuntimeError(f"{method}: {traceback.format_exc()}")
             connection.send(answer)
     except (EOFError, OSError, KeyboardInterrupt):
         return
+
+
+if __name__ == "__main__":
+    _serve(Connection(int(sys.argv[1])))
