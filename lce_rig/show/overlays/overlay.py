@@ -234,6 +234,7 @@ def draw_check(
         uncertainty=sizes(c.sigma_rotation_deg, c.sigma_translation_m),
         findings=[finding.sentence for finding in (*c.findings, *check.findings)],
         limits_m=limits_m,
+        other_camera=c.lidar if c.is_of_cameras else "",
         shown=shown,
     )
     write_atomically(folder / PAGE, page)
@@ -243,7 +244,8 @@ def _figures(name: str, check: SessionCheck) -> Iterator[str]:
     """List a capture's residuals, and how far a hand-held board moved between scan and image."""
     for r in check.residuals:
         if r.capture == name:
-            yield f"planes {1000 * r.plane_mean_m:.1f} mm, edges {1000 * r.edge_mean_m:.1f} mm"
+            edges = f", edges {1000 * r.edge_mean_m:.1f} mm" if math.isfinite(r.edge_mean_m) else ""
+            yield f"planes {1000 * r.plane_mean_m:.1f} mm{edges}"
             if math.isfinite(r.reprojection_px):
                 yield f"corners {r.reprojection_px:.2f} px"
     meeting = check.meetings.get(name)

@@ -204,13 +204,14 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     if c.verdict == "fail":
         earlier = " The last usable result is in `previous/`." if has_previous else ""
         return [*steps, f"Then run `lce-rig calibrate {shlex.quote(folder)}` again.{earlier}"]
+    look_for = "ring ends must lie on the board's outline on all sides."
+    if c.is_of_lidars:
+        look_for = "both clouds must show the board in one place."
+    elif c.is_of_cameras:
+        look_for = f"corners by {c.lidar} must lie on those of the pattern."
     return [
         *steps,
-        f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
-        "both clouds must show the board in one place."
-        if c.is_of_lidars
-        else f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
-        "ring ends must lie on the board's outline on all sides.",
+        f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): {look_for}",
         "Collect a second session on another day, calibrate it and compare both: "
         f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
         *optional,
