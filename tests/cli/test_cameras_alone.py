@@ -2,8 +2,12 @@
 
 import cv2
 import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from lce_rig.core.calibration import read_result
+from lce_rig.core.data import Image
+from lce_rig.io.ros.bag_recorder import IMAGE_TYPE, encode_image
 from lce_rig.rig import load_rig
 from lce_rig.rig.loading import dump_rig
 from lce_rig.simulate.sampling import simulate_captures
@@ -42,6 +46,28 @@ def test_images_of_two_cameras_give_a_robot_description(stereo, tmp_path, lce_ri
     assert len(list((session / "calibration/overlays").glob("*.png"))) == 10
     assert lce_rig("export", session, "--formats", "kalibr", "-o", tmp_path / "out").code == 0
     assert (tmp_path / "out/camchain.yaml").exists()
+
+
+def test_bag_of_two_cameras_is_cut_where_the_board_stands_still(stereo, tmp_path, lce_rig):
+    rig = load_rig(stereo / "stereo.yaml")
+    with Writer(tmp_path / "drive", version=8) as writer:
+        topics = {
+            name: writer.add_connection(
+                camera.channels["frames"].topic, IMAGE_TYPE, typestore=get_typestore(Stores.ROS2_HUMBLE)
+            )
+            for name, camera in rig.cameras.items()
+        }
+        for placement in range(2):
+            for step in range(15):
+                stamp_ns = round(1e18) + 10**8 * (40 * placement + step)
+                for name, topic in topics.items():
+                    pixels = cv2.imread(str(stereo / f"images/{name}/{placement:06d}.png"), 0)
+                    data = encode_image(Image(name, "frames", stamp_ns, pixels), f"{name}_optical", False)
+                    writer.write(topic, stamp_ns, data)
+    run = lce_rig(
+        "collect", "--rig", stereo / "stereo.yaml", tmp_path / "session", "--from", tmp_path / "drive"
+    )
+    assert run.code == 0 and "2 captures" in run.out + run.err
 
 
 def test_images_of_one_camera_are_refused_with_both_folders(stereo, tmp_path, lce_rig):

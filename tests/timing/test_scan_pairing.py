@@ -1,5 +1,7 @@
 """Streams of several sensors become frames."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lce_rig.core.data import Image, Scan
@@ -81,3 +83,15 @@ def test_the_nearest_picture_is_told_of_scans_that_found_none(rig):
     found, losses = pairs(samples, rig)
     assert found == [(1000, [1000])]
     assert alone(losses) == (2, 0.1)
+
+
+def test_pairing_without_lidar_joins_images_of_two_cameras(rig):
+    camera = rig.cameras["cam"]
+    both = rig.model_copy(update={"lidars": {}, "cameras": {"cam": camera, "other": camera}})
+    samples = [replace(image(t + 10), sensor="other") for t in (1000, 1100)]
+    samples += [image(t) for t in (1000, 1100, 1500)]
+    losses = Losses()
+    frames = list(pair_by_time(sorted(samples, key=lambda s: s.stamp_ns), both, losses))
+    assert [[i.sensor for i in f.images] for f in frames] == [["cam", "other"]] * 2
+    assert not any(f.scans for f in frames)
+    assert [finding.code for finding, _ in losses.counts()] == ["read.no_other"]
