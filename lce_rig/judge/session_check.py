@@ -1,6 +1,7 @@
 """Compare extrinsics with the boards in every capture of a session."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -173,7 +174,7 @@ class SessionCheck:
             "doubts": [doubt.as_json() for doubt in self.findings],
             "metrics": None
             if self.metrics is None
-            else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
+            else _finite({**asdict(self.metrics), "mge_m": self.metrics.mge_m}),
             "scene": {
                 "state": self.scene.state,
                 "n_captures": self.scene.n_captures,
@@ -181,11 +182,19 @@ class SessionCheck:
                 "axes": [axis.document() for axis in self.scene.axes],
             },
             "captures": {
-                r.capture: {"was_used": r.capture in used, **{name: getattr(r, name) for name in names}}
+                r.capture: {
+                    "was_used": r.capture in used,
+                    **_finite({name: getattr(r, name) for name in names}),
+                }
                 for r in self.residuals
             },
             "page": None if self.page is None else str(self.page),
         }
+
+
+def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
+    """Replace figures that are not known by null, for JSON."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
 def check_session(

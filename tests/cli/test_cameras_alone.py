@@ -43,6 +43,7 @@ def test_images_of_two_cameras_give_a_robot_description(stereo, tmp_path, lce_ri
     assert "right_link" in (session / "calibration/stereo.urdf").read_text()
     verified = lce_rig("verify", session)
     assert verified.code == 0 and "agree with the extrinsics" in verified.out
+    assert lce_rig("verify", session, "--json").code == 0
     assert len(list((session / "calibration/overlays").glob("*.png"))) == 10
     assert lce_rig("export", session, "--formats", "kalibr", "-o", tmp_path / "out").code == 0
     assert (tmp_path / "out/camchain.yaml").exists()
