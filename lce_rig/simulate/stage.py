@@ -187,8 +187,8 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     )
 
 
-def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:
-    """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR.
+def require_lidar(rig: Rig) -> None:
+    """Check that a rig can be simulated.
 
     Raises:
         ProfileError: the rig has no LiDAR.
@@ -198,6 +198,15 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
             f"rig {rig.name}: without a LiDAR it cannot be simulated",
             "Simulate its cameras beside a LiDAR, as in the rig two_cameras.",
         )
+
+
+def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:
+    """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR.
+
+    Raises:
+        ProfileError: the rig has no LiDAR.
+    """
+    require_lidar(rig)
     links: list[tuple[str, str, Array]] = []
     for index, entry in enumerate(rig.nominal_extrinsics):
         rng = np.random.default_rng([options.mounting_of(seed), OF_SESSION, TRUTH, index])

@@ -29,6 +29,7 @@ from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.placements import between
+from lce_rig.simulate.stage import require_lidar
 
 # How people behave: they react, walk, and try again where nothing happens.
 REACTION_S = 0.7
@@ -103,6 +104,7 @@ class SimulatedRig:
         Raises:
             ProfileError: no camera of the rig has frames, or its LiDAR is not known.
         """
+        require_lidar(rig)
         framed = [name for name, camera in rig.cameras.items() if camera.first_channel("frames")]
         if rig.cameras and not framed:
             raise ProfileError(
