@@ -107,7 +107,9 @@ def solve_peers(
             solved.append(_solve(rig, detections, pair, options, lenses))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
-            shortages.append(replace(shortage, subject=str(pair)))
+            # A camera with few scans of a LiDAR lacks those: that is reported with the LiDAR.
+            if pair in detections.peers(rig.lidars):
+                shortages.append(replace(shortage, subject=str(pair)))
     return solved, shortages
 
 

@@ -172,11 +172,11 @@ def test_a_part_that_is_torn_does_not_end_the_others(rles):
 
 
 def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rles):
-    require_sensors(JoinedRecording([lidar(), camera()], rles))
+    require_sensors(JoinedRecording([lidar(), camera()], rles), rles)
     with pytest.raises(SourceError, match=r"events\.aedat4"):
-        require_sensors(camera())
+        require_sensors(camera(), rles)
     with pytest.raises(SourceError, match=r"lidar\.bag") as caught:
-        require_sensors(lidar())
+        require_sensors(lidar(), rles)
     assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 
 
