@@ -94,14 +94,14 @@ def test_clocks_are_named_beside_a_change_that_they_explain(straight):
     drift = watch_captures(straight, 100_000_000)
     assert drift.state == "changed"
     summary, clocks, *_ = drift.findings
-    assert (summary.code, clocks.code) == ("scene.changed", "scene.clocks_instead")
+    assert summary.code in ("scene.changed", "scene.elsewhere") and clocks.code == "scene.clocks_instead"
     assert clocks.figures["apart_s"] == pytest.approx(0.1, abs=0.03)
 
 
 def test_clocks_are_not_named_where_only_the_extrinsics_explain(driven):
     shifted = perturb(driven[0][0].truth("cam", "lidar"), np.array([0.15, 0, 0, 0, 0, 0]))
     drift = watch_captures(driven, T_cam_lidar=shifted)
-    assert drift.state == "changed" and "translation_x" in drift.findings[0].figures["axes"]
+    assert drift.state == "changed" and abs(drift.change.tangent[0] + 0.15) < 0.05
     assert not [f for f in drift.findings if f.code.startswith("scene.clocks")]
 
 
