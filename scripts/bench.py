@@ -49,10 +49,6 @@ PARTS: dict[str, tuple[str, Part]] = {
         "extrinsics checked without a board, on recordings by others",
         lambda bench, a: bench(min(a.splits, 2), a.only),
     ),
-    "scene_without_rings": (
-        "the same for KITTI's clouds and a simulated Mid-360",
-        lambda bench, a: bench(a.seeds or 20, a.only),
-    ),
     "scene_estimate": (
         "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
         lambda bench, a: bench(a.seeds or 100, a.only),

@@ -34,7 +34,7 @@ from results of earlier versions.
 | `check` | the detections in each capture, or its refusal |
 | `calibrate` | result.json, with `findings` and `captures_refused` of each camera and LiDAR |
 | `verify` | residuals of each capture; `doubts`: findings by which captures contradict the extrinsics |
-| `drift` | for each camera and LiDAR its `state`, each axis with figures, `findings` |
+| `drift` | for each camera and LiDAR its `state`, the opinions of scene and boards with figures, `findings` |
 | `repeat` | `findings` on the sessions; for each camera and LiDAR figures and a `finding`, the verdict |
 | `doctor` | each check with its `findings` ([more](doctor.md)) |
 

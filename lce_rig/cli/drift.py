@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,12 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, explain_option, json_option, path_option
-from lce_rig.core.calibration import AxisDrift, ResultFile, State, read_result
+from lce_rig.core.calibration import ResultFile, State, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import open_live
+from lce_rig.judge.board_drift import BoardDrift
 from lce_rig.pipeline.pair_drift import DriftReport, PairDrift
 from lce_rig.pipeline.verification import profile_behind
 from lce_rig.pipeline.watch_drift import drift as watch_drift
@@ -22,7 +22,6 @@ from lce_rig.pipeline.watch_drift import drift_live
 from lce_rig.rig import Rig, load_rig
 from lce_rig.scene.findings import STATES
 from lce_rig.show.screen.keys import controls
-from lce_rig.show.tables import axis_table
 
 
 @click.command()
@@ -57,7 +56,7 @@ def drift(
     RECORDING is a session or, with --rig, a folder of images and point clouds, a bag, an mcap, or several
     simultaneous recordings. With --rig and no RECORDING, the attached sensors are watched until Ctrl-C. Edges
     of the scans are compared with edges of the images, and with the board where it is in view.
-    Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither opinion can tell.
+    Exits with 0 if the extrinsics hold, with 7 if they changed, and with 6 if neither opinion can tell.
     """
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:
@@ -92,8 +91,8 @@ def drift(
     for state, error in outcomes.items():
         concerned = [pair for pair in report.pairs if pair.state == state]
         if concerned:
-            summary, names = concerned[0].summary, ", ".join(map(_sensors, concerned))
-            raise error(f"{STATES[state]}: {names}", as_line(summary.advice) if as_json else "")
+            names = ", ".join(map(_sensors, concerned))
+            raise error(f"{STATES[state]}: {names}", as_line(concerned[0].advice) if as_json else "")
 
 
 # What was seen is judged after Ctrl-C; a second one ends that too.
@@ -118,17 +117,6 @@ def _watch_live(rig: Rig, saved: ResultFile, seconds: float | None) -> DriftRepo
 
 
 _COLOURS: dict[State, str] = {"unchanged": "green", "changed": "red", "unknown": "yellow"}
-# Of one axis or one opinion; the table names the axes already.
-_OF_AXES = (
-    "scene.axis_unchanged",
-    "scene.axis_changed",
-    "scene.large_scatter",
-    "scene.flat",
-    "scene.no_peak",
-    "scene.board_changed",
-    "scene.board_unsure",
-)
-_OF_SCENE = ("scene.unchanged", "scene.changed", "scene.unknown")
 
 
 def _sensors(pair: PairDrift) -> str:
@@ -136,28 +124,18 @@ def _sensors(pair: PairDrift) -> str:
 
 
 def _parts(pair: PairDrift) -> Iterator[Any]:
-    """State the verdict, each axis, further causes, and one action."""
-    data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
-    data += "" if pair.board is None else f", {show.counted(pair.board.n_boards, 'board')}"
+    """State the verdict, the scene's answer, that of the boards, and one action."""
+    data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.estimate.n_edges} edges"
     yield f"[bold]{_sensors(pair)}[/]: [{_COLOURS[pair.state]}]{STATES[pair.state]}[/] ({data})"
-    yield show.text_table(axis_table("", [_opinion(pair, index) for index in range(len(pair.drift.axes))]))
-    # With a board, the verdict on both stands for the scene's own.
-    omitted = {pair.summary.code, *(_OF_SCENE if pair.board is not None else ())}
-    for finding in pair.findings:
-        if finding.code in omitted and finding.code != "scene.few_edges":
-            continue
-        if finding.severity != "note" and finding.code not in _OF_AXES:
-            yield f"  {show.escape(as_line(finding.text))}"
-    if pair.summary.advice:
-        yield f"  -> {show.escape(as_line(pair.summary.advice))}"
+    for finding in (*pair.contradictions, *pair.drift.findings):
+        yield f"  {show.escape(as_line(finding.text))}"
+    if pair.board is not None:
+        yield f"  {show.escape(as_line(_of_boards(pair.board)))}"
+    if pair.advice:
+        yield f"  -> {show.escape(as_line(pair.advice))}"
 
 
-def _opinion(pair: PairDrift, index: int) -> AxisDrift:
-    """Return what the scene or the boards measured along an axis, whichever decided its state."""
-    scene = pair.drift.axes[index]
-    state = pair.states[scene.axis]
-    if pair.board is None:
-        return scene
-    deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
-    best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
-    return replace(best, state=state)
+def _of_boards(board: BoardDrift) -> str:
+    """Return the first finding of the boards; what they hide if there is no other."""
+    opinion = f"{show.counted(board.n_boards, 'board')}: {STATES[board.state]}"
+    return f"{opinion}; {board.findings[0].text}"

@@ -277,78 +277,26 @@ MOTIONS: tuple[Motion, ...] = get_args(Motion)
 
 
 State = Literal["unchanged", "changed", "unknown"]
-# In files of earlier versions.
-_STATES = {"agrees": "unchanged", "contradicts": "changed"}
+Opinion = Literal["agrees", "contradicts", "unknown"]
 
 
-@dataclass(frozen=True)
-class AxisDrift:
-    """What a scene or boards say about extrinsics along one axis, the others unchanged.
-
-    result.json keeps all but the last two attributes.
-
-    Attributes:
-        axis: "translation_x" to "rotation_z", axes of the camera.
-        state: "unknown" where they cannot tell.
-        change: from the extrinsics to those that fit best, m or deg.
-        sigma: standard deviation of `change`, that of the extrinsics included.
-        smallest: the smallest change that would be seen in 95 % of trials; infinite if none within reach.
-        reason: why they cannot tell, the code of a finding; "" otherwise.
-        instead: axes of which one might have changed in place of this one, since it explains nearly as much.
-    """
-
-    axis: str
-    state: Annotated[State, BeforeValidator(lambda state: _STATES.get(str(state), state))]
-    change: Number
-    sigma: Distance
-    smallest: Distance
-    reason: Annotated[str, _ANY, _IN_MEMORY] = ""
-    instead: Annotated[tuple[str, ...], _ANY, _IN_MEMORY] = ()
-
-    @property
-    def unit(self) -> Literal["deg", "m"]:
-        """Of the figures."""
-        return "deg" if self.axis.startswith("rotation") else "m"
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """The figures by their names with the unit, as findings hold them."""
-        return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
-
-    def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON; figures that are not finite are null."""
-        finite = {name: value if math.isfinite(value) else None for name, value in self.figures.items()}
-        return {"axis": self.axis, "state": self.state, **finite, "instead": list(self.instead)}
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SceneOpinion:
     """The scene's opinion on the extrinsics of a camera and a LiDAR, without the edges at the board.
 
     Attributes:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
-        n_edges: depth edges in or near their images.
-        axes: one opinion each, order of a tangent; empty if there are too few edges to compare.
+        n_edges: of the scans, in or near their images.
+        state: whether the edges contradict the extrinsics, or cannot tell.
+        change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
+        cov: (6, 6) of the change, that of the extrinsics included.
     """
 
     n_captures: Count
     n_edges: Count
-    axes: tuple[AxisDrift, ...] = ()
-
-    @property
-    def state(self) -> Literal["agrees", "contradicts", "unknown"]:
-        """Contradicts if any axis changed; agrees if at least one is known and none changed."""
-        states = {axis.state for axis in self.axes}
-        return "contradicts" if "changed" in states else "agrees" if "unchanged" in states else "unknown"
-
-    def of(self, state: State) -> tuple[AxisDrift, ...]:
-        """List the axes of a state."""
-        return tuple(axis for axis in self.axes if axis.state == state)
-
-    @property
-    def strongest(self) -> AxisDrift | None:
-        """The axis that contradicts by most standard deviations; None if none does."""
-        return max(self.of("changed"), key=lambda axis: abs(axis.change) / axis.sigma, default=None)
+    state: Opinion = "unknown"
+    change: Values | None = None
+    cov: Values | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,12 +384,7 @@ class Calibration:
     intrinsics_cross_cov: Values | None = None
     square_m: Size | None = None
     board_shape: Values | None = None
-    scene: (
-        Annotated[
-            SceneOpinion, WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
-        ]
-        | None
-    ) = None
+    scene: SceneOpinion | None = None
     board_distances_m: tuple[Size, ...] = ()
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)

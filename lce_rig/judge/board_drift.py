@@ -25,7 +25,7 @@ from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, Tolera
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
 from lce_rig.calibrate.uncertainty import widen
-from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
+from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, State
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
@@ -33,16 +33,47 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.reach import JointDifference
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import Rig
-from lce_rig.scene.alignment import IS_ROTATION
-from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS
 from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_HIDES, BOARD_UNSURE
 
 # Standard deviation of the difference between sessions of one rig beyond both covariances, m and rad: three
 # recorded sessions of one rig (rlfs01 to rlfs03) differ by up to 7 mm and 0.22 deg.
 _BIAS = np.repeat([0.005, np.radians(0.1)], 3)
+_THRESHOLD_SIGMAS = 3.0  # of the change of one axis
+_POWER_SIGMAS = 1.645  # 95 % of the trials at the smallest change exceed the threshold.
+# Boards that see only larger changes cannot tell, m and rad.
+_LARGEST = np.repeat([0.10, np.radians(1.5)], 3)
 _MIN_PLACEMENTS = 3  # Fewer do not determine the scatter.
 # Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
 _CHANGED_CHI2 = 22.46
+
+
+@dataclass(frozen=True)
+class AxisDrift:
+    """What boards say about extrinsics along one axis, the others unchanged.
+
+    Attributes:
+        axis: "translation_x" to "rotation_z", axes of the camera.
+        state: "unknown" where they cannot tell.
+        change: from the extrinsics to those that fit best, m or deg.
+        sigma: standard deviation of `change`, that of the extrinsics included.
+        smallest: the smallest change that would be seen in 95 % of trials.
+    """
+
+    axis: str
+    state: State
+    change: float
+    sigma: float
+    smallest: float
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures by their names with the unit, as findings hold them."""
+        unit = "deg" if self.axis.startswith("rotation") else "m"
+        return {f"{name}_{unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
+
+    def document(self) -> dict[str, Any]:
+        """List everything as plain types for JSON."""
+        return {"axis": self.axis, "state": self.state, **self.figures}
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +106,7 @@ class JointDrift(JointDifference):
         """The largest change that the boards would not show, along their least determined direction."""
         variances, directions = self.directions
         # A shift of the mean by this much exceeds the threshold in about 95 % of trials.
-        size = np.sqrt(_CHANGED_CHI2) + POWER_SIGMAS
+        size = np.sqrt(_CHANGED_CHI2) + _POWER_SIGMAS
         least_known = directions[:, -1]
         rotation_deg, translation_m = tangent_sizes(size * np.sqrt(variances[-1]) * least_known / self.scale)
         weights = np.abs(least_known)
@@ -106,6 +137,7 @@ class BoardDrift:
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
         return {
+            "state": self.state,
             "n_boards": self.n_boards,
             "n_placements": self.n_placements,
             "mpe_m": self.metrics.mpe_m,
@@ -117,6 +149,14 @@ class BoardDrift:
                 "chi2": self.joint.chi2,
             },
         }
+
+    @property
+    def state(self) -> State:
+        """The verdict: changed in one axis or jointly; unchanged only if each axis is known."""
+        states = {axis.state for axis in self.axes}
+        if self.joint.is_changed or "changed" in states:
+            return "changed"
+        return "unknown" if "unknown" in states else "unchanged"
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -190,14 +230,13 @@ def _alone(axis: int, change: Array, cov: Array) -> tuple[float, float]:
 
 def _judge(axis: int, change: Array, cov: Array) -> AxisDrift:
     """Judge one axis of a change (6,) with covariance (6, 6), if no other changed."""
-    unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
+    unit = float(np.degrees(1.0)) if axis > 2 else 1.0
     size, variance = _alone(axis, change, cov)
     sigma = float(np.sqrt(variance))
-    smallest = (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma
+    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
     state: State = "unchanged"
-    if abs(size) > THRESHOLD_SIGMAS * sigma:
+    if abs(size) > _THRESHOLD_SIGMAS * sigma:
         state = "changed"
-    elif smallest > LARGEST[axis]:
+    elif smallest > _LARGEST[axis]:
         state = "unknown"
-    reason = "" if state != "unknown" else "scene.board_unsure"
-    return AxisDrift(MOTIONS[axis], state, unit * size, unit * sigma, unit * smallest, reason)
+    return AxisDrift(MOTIONS[axis], state, unit * size, unit * sigma, unit * smallest)

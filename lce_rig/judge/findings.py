@@ -519,7 +519,8 @@ MAY_BE_OFF = Kind(
 )
 SCENE = Kind(
     "verdict.scene",
-    "the edges of the scene contradict the extrinsics: {axis:motion} by {change:+1size} +- {sigma:1size}",
+    "the edges of the scene contradict the extrinsics by {rotation_deg:deg} +- {sigma_deg:deg}, "
+    "{translation_m:mm} +- {sigma_m:mm}: {axes:motion}",
     f"check intrinsics and board {_LOOK}",
     actions={
         "deployed": f"a sensor may have moved {_LOOK}",

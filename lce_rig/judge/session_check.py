@@ -179,7 +179,8 @@ class SessionCheck:
                 "state": self.scene.state,
                 "n_captures": self.scene.n_captures,
                 "n_edges": self.scene.n_edges,
-                "axes": [axis.document() for axis in self.scene.axes],
+                "change": None if self.scene.change is None else self.scene.change.tolist(),
+                "covariance": None if self.scene.cov is None else self.scene.cov.tolist(),
             },
             "captures": {
                 r.capture: {

@@ -42,6 +42,7 @@ from lce_rig.judge.findings import (
     verdict_of,
 )
 from lce_rig.judge.intrinsics_check import lens_findings
+from lce_rig.judge.scene_drift import SceneChange
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
@@ -60,8 +61,9 @@ _SURE, _LATE_S = 3.0, 0.1
 MAX_PLANE_MISFIT_M = 0.012
 """Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
 reach 20 to 30 mm."""
-# Scene contradictions: 5 standard deviations fail, 3 give a warning.
-SCENE_FAILS = 5.0
+# Least chi-squared, of six degrees of freedom, of a scene that fails a result: a chance of 6e-7, as of 5
+# standard deviations of one quantity. A contradiction below it, from `CHANGED_CHI2` on, is a warning.
+SCENE_FAILS_CHI2 = 39.5
 
 
 def judge(
@@ -170,17 +172,15 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
         calibration: the extrinsics.
         action: if known already.
     """
-    worst = opinion.strongest
-    if worst is None:
+    if opinion.state != "contradicts" or opinion.change is None or opinion.cov is None:
         return []
+    change = SceneChange(opinion.change, opinion.cov)
     has_moving_boards = any(each.time_offset_s is not None for each in calibration.channel_results)
-    if not action and worst.axis == "translation_z":
+    if not action and change.main_axes == ("translation_z",):
         action = "distances"
     elif not action and has_moving_boards:
         action = "times"
-    sigmas = abs(worst.change) / worst.sigma
-    sizes: dict[str, Any] = {f"change_{worst.unit}": worst.change, f"sigma_{worst.unit}": worst.sigma}
-    return [SCENE(severity=failing(sigmas > SCENE_FAILS), action=action, axis=worst.axis, **sizes)]
+    return [SCENE(severity=failing(change.chi2 > SCENE_FAILS_CHI2), action=action, **change.figures)]
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:

@@ -11,32 +11,29 @@ from lce_rig.core.calibration import Calibration, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, PoseDifference
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
+from lce_rig.judge.scene_drift import HOLDS_CHI2, SceneDrift, watch_scene
 from lce_rig.rig import Rig
-from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import Drift, overall, watch
 from lce_rig.scene.findings import (
-    CHANGED_WITH_BOARD,
     CLOCKS_APART,
     CLOCKS_INSTEAD,
     CONTRADICTION,
     EVENTS_OF_STANDING_RIG,
     NO_FIRING_TIMES,
     NO_SAMPLES,
-    UNCHANGED_WITH_BOARD,
-    UNKNOWN_WITH_BOARD,
 )
+from lce_rig.scene.outline_score import OutlineView
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
-from lce_rig.scene.views import build_view, without_board, without_movers
+from lce_rig.scene.views import build_view, evenly, without_board, without_movers
 from lce_rig.show.overlays.canvas import accumulated, write_picture
 from lce_rig.show.overlays.overlay import draw_edges
 from lce_rig.timing.scan_pairing import event_channel, rig_time_ns
 
+_ORDER: tuple[State, ...] = ("changed", "unchanged", "unknown")
 _MIN_MOVING = 3
 _MAX_BOARDS = 20
 #: Of events this long about the time at which the LiDAR looks where the camera does.
@@ -71,83 +68,53 @@ class PairDrift:
     """
 
     calibration: Calibration
-    drift: Drift
+    drift: SceneDrift
     board: BoardDrift | None
-    example: tuple[str, Image, SceneView] | None
-
-    @property
-    def states(self) -> dict[str, State]:
-        """Both opinions on each axis: unchanged if either covers it, unknown where they contradict.
-
-        A change is what one of them finds and the other does not refute; or the boards in all axes together.
-        """
-        scene = {axis.axis: axis.state for axis in self.drift.axes}
-        if self.board is None:
-            return scene
-        order: tuple[State, ...] = ("changed", "unchanged", "unknown")
-        states = {
-            axis.axis: next(state for state in order if state in (scene[axis.axis], axis.state))
-            for axis in self.board.axes
-        }
-        states |= dict.fromkeys((each.subject for each in self.contradictions), "unknown")
-        return states | dict.fromkeys(self.board.joint.axes, "changed")
-
-    @property
-    def contradictions(self) -> list[Finding]:
-        """Axes that one of both finds changed, and the other measured to be nearer to unchanged."""
-        found = []
-        for scene, board in zip(self.drift.axes, () if self.board is None else self.board.axes, strict=False):
-            pair = {scene.state: scene, board.state: board}
-            if pair.keys() != {"changed", "unchanged"}:
-                continue
-            change, other = pair["changed"].change, pair["unchanged"].change
-            if abs(other) < abs(other - change):
-                figures = {f"board_{scene.unit}": board.change, f"board_sigma_{scene.unit}": board.sigma}
-                found.append(CONTRADICTION(scene.axis, **scene.figures, **figures))
-        return found
+    example: tuple[str, Image, OutlineView] | None
 
     @property
     def state(self) -> State:
-        """The verdict on all axes."""
-        return overall(self.states.values())
+        """The verdict: a change that one opinion finds and the other does not refute.
+
+        It holds if either opinion covers it, and is unknown where they contradict each other.
+        """
+        states: list[State] = [self.drift.state, *([] if self.board is None else [self.board.state])]
+        if self.contradictions:
+            return "unknown"
+        return next((state for state in _ORDER if state in states), "unknown")
 
     @property
-    def summary(self) -> Finding:
-        """The verdict as a finding."""
-        if self.board is None:
-            return self.drift.findings[0]
-        kind = {
-            "changed": CHANGED_WITH_BOARD,
-            "unknown": UNKNOWN_WITH_BOARD,
-            "unchanged": UNCHANGED_WITH_BOARD,
-        }[self.state]
-        return kind(
-            n_captures=self.drift.n_captures,
-            n_boards=self.board.n_boards,
-            changed=tuple(axis for axis, state in self.states.items() if state == "changed"),
-            unknown=tuple(axis for axis, state in self.states.items() if state == "unknown"),
-        )
+    def contradictions(self) -> list[Finding]:
+        """The finding that boards hold by which the scene's change is excluded, if they do."""
+        if self.board is None or (self.drift.state, self.board.state) != ("changed", "unchanged"):
+            return []
+        scene, board = self.drift.change, self.board.joint
+        apart = PoseDifference(scene.tangent - board.tangent, scene.cov + board.cov)
+        return [CONTRADICTION(**apart.sizes)] if apart.chi2 > HOLDS_CHI2 else []
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
-        if self.board is None:
-            return self.drift.findings
-        return (self.summary, *self.contradictions, *self.drift.findings, *self.board.findings)
+        """What contradicts, then the scene's opinion, then the board's."""
+        board = () if self.board is None else self.board.findings
+        return (*self.contradictions, *self.drift.findings, *board)
+
+    @property
+    def advice(self) -> str:
+        """The action of the first finding that decides the verdict."""
+        if self.state == "unchanged":
+            return ""
+        return next((each.advice for each in self.findings if each.severity != "note" and each.advice), "")
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
+        is_changed = self.drift.state == "changed"
         return {
             "camera": self.calibration.camera,
             "lidar": self.calibration.lidar,
             "state": self.state,
-            "states": self.states,
-            "scene_state": self.drift.state,
-            "n_captures": self.drift.n_captures,
-            "n_edges": self.drift.n_edges,
-            "axes": [axis.document() for axis in self.drift.axes],
-            "contradictions": [each.subject for each in self.contradictions],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
+            "T_changed": self.drift.T_changed.tolist() if is_changed else None,
+            "scene": self.drift.document(),
             "board": None if self.board is None else self.board.document(),
             "findings": [finding.as_json() for finding in self.findings],
         }
@@ -182,7 +149,7 @@ class DriftReport:
             if pair.drift.state == "changed":
                 poses["changed"] = pair.drift.T_changed
             title = f"{c.camera}, {c.lidar}  {name}"
-            picture = draw_edges(image, view.edges, self.rig.lens_of(c), poses, title)
+            picture = draw_edges(image, view.outlines, self.rig.lens_of(c), poses, title)
             files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
         return files
 
@@ -197,8 +164,8 @@ class PairJudge:
     def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
         """Judge deployed extrinsics by captures of a scene."""
         lens = self._rig.lens_of(c)
-        views: list[SceneView] = []
-        whole: list[SceneView] = []
+        views: list[OutlineView] = []
+        whole: list[OutlineView] = []
         boards: list[tuple[Seen, ImageBoard]] = []
         moving: list[MovingView] = []
         n_untimed = 0
@@ -206,12 +173,12 @@ class PairJudge:
             view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
             motion = self._motion(seen)
             if motion is not None:
-                after_s = _after_s(view.edges.points, seen, self._rig, c)
+                after_s = _after_s(view.outlines.points, seen, self._rig, c)
                 if after_s is None:
                     n_untimed += 1
                     continue
-                points = motion.moved(view.edges.points, after_s)
-                view = replace(view, edges=replace(view.edges, points=points))
+                points = motion.moved(view.outlines.points, after_s)
+                view = replace(view, outlines=replace(view.outlines, points=points))
                 moving.append(MovingView(view, motion))
             whole.append(view)
             if isinstance(seen.image, Image):
@@ -223,20 +190,21 @@ class PairJudge:
         if boards:
             # Who holds the board moves with it.
             views = without_movers(views)
-        judged = watch(views, lens, c.T_cam_lidar, c.cov)
+        judged = watch_scene(views, lens, c)
+        others: list[Finding] = []
+        if len(moving) >= _MIN_MOVING and judged.estimate.state != "few_edges":
+            others += _clocks(judged, moving, lens, c.camera)
         if not kept:
-            judged = replace(judged, findings=(NO_SAMPLES(c.camera, lidar=c.lidar),))
+            others.append(NO_SAMPLES(c.camera, lidar=c.lidar))
         elif n_untimed:
-            untimed = NO_FIRING_TIMES(c.lidar, n_captures=n_untimed)
-            judged = replace(judged, findings=(*judged.findings, untimed))
+            others.append(NO_FIRING_TIMES(c.lidar, n_captures=n_untimed))
         if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
-            judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
-        if len(moving) >= _MIN_MOVING and judged.is_compared:
-            judged = _with_clocks(judged, moving, lens, c.camera)
+            others.append(EVENTS_OF_STANDING_RIG(c.camera))
+        judged = replace(judged, others=tuple(others))
         example = None
         if whole:
             # The picture is of the capture with most edges.
-            view = max(whole, key=lambda each: len(each.edges))
+            view = max(whole, key=lambda each: len(each.outlines))
             image = next(seen.image for seen in kept if seen.name == view.capture)
             if isinstance(image, Events):
                 image = Image(image.sensor, "events", None, accumulated(image))
@@ -279,23 +247,13 @@ def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | Non
     return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
 
 
-def _with_clocks(judged: Drift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> Drift:
-    """Give no all-clear where the images of a moving rig fit the scans of another time.
-
-    Where the extrinsics seem changed, clocks that explain it nearly as well are named beside them.
-    """
+def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> list[Finding]:
+    """Find whether the images of a moving rig fit the scans of another time, as they do a change."""
     is_changed = judged.state == "changed"
     apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
     if apart_s is None:
-        return judged
-    found = (CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)
-    axes = tuple(
-        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
-        for axis in judged.axes
-    )
-    first, *rest = judged.findings
-    others = [each for each in rest if each.code != "scene.axis_unchanged"]
-    return replace(judged, axes=axes, findings=(*([first] if is_changed else []), found, *others))
+        return []
+    return [(CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)]
 
 
 def own_offset_ns(c: Calibration, channel: str) -> int:

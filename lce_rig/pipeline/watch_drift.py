@@ -28,8 +28,7 @@ from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, PairJudge, Seen,
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
-from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.views import MAX_CAPTURES
+from lce_rig.scene.views import MAX_CAPTURES, evenly
 from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.scan_pairing import (

@@ -5,10 +5,9 @@ from contextlib import suppress
 from lce_rig.core.calibration import Calibration, SceneOpinion
 from lce_rig.core.errors import SessionError
 from lce_rig.detect.detection import Detections
-from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import watch
-from lce_rig.scene.views import build_view, without_board, without_movers
+from lce_rig.judge.scene_drift import watch_scene
+from lce_rig.scene.outline_score import OutlineView
+from lce_rig.scene.views import build_view, evenly, without_board, without_movers
 from lce_rig.session import Session
 
 _MOST_CAPTURES = 6
@@ -27,11 +26,10 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
     """
     c = calibration
     views = scene_views(session, detections, c)
-    drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov)
-    return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.is_compared else ())
+    return watch_scene(without_movers(views), session.rig.lens_of(c), c).opinion
 
 
-def scene_views(session: Session, detections: Detections, c: Calibration) -> list[SceneView]:
+def scene_views(session: Session, detections: Detections, c: Calibration) -> list[OutlineView]:
     """Find the edges of the scene without those at the board; arguments as of `hear_scene`."""
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 
 SIGMAS_RAD = (0.024, 0.012, 0.006, 0.003)
@@ -19,6 +20,7 @@ _WINDOW_RAD, _WINDOW_SIGMAS = 0.12, 20.0  # Window across an edge, at least, and
 _WINDOW_ASPECT = 4  # by its length along the edge.
 _FLOOR = 0.005  # of the mean edge strength in a window, as a share of the strongest
 _OUTLIERS = 0.5  # Share of outlines without an image edge.
+_CLEAR = 0.5  # Log-likelihood ratio of an edge that stands out.
 _SAMPLES_PER_SIGMA = 1.5  # Coarse fields are stored at a lower resolution.
 
 
@@ -62,6 +64,14 @@ class EdgePyramid:
 
     levels: Sequence[tuple[EdgeLayer, EdgeLayer]]
 
+    def has_edges_near(self, pixels: Array, reach_px: float) -> NDArray[np.bool_]:
+        """Find which pixels (N, 2) of the image have an upright edge within a distance."""
+        layer, _ = self.levels[-1]
+        side = 2 * round(reach_px / layer.reduction) + 1
+        near = np.array(layer.values)
+        near[..., 0] = cv2.dilate((near[..., 0] > _CLEAR).astype(np.float32), np.ones((side, side)))
+        return np.asarray(EdgeLayer(near, layer.reduction).sample(pixels)[:, 0] > 0, dtype=np.bool_)
+
 
 def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
     """Turn an image into fields of its upright and its level edges.
@@ -76,7 +86,29 @@ def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
     reduction = 1
     while focal_px / reduction > _WORKING_FOCAL_PX:
         reduction *= 2
-    strengths = _edge_strengths(_reduced(grey.astype(np.float32), reduction))
+    return _pyramid(_edge_strengths(_reduced(grey.astype(np.float32), reduction)), focal_px, reduction)
+
+
+def build_event_pyramid(events: Events, focal_px: float) -> EdgePyramid:
+    """Turn the events of a short time into fields: where brightness changed, an edge passed.
+
+    Their count per pixel takes the place of both gradients: only edges that move, or that a moving rig
+    passes, are in it.
+
+    Args:
+        events: of a few hundredths of a second.
+        focal_px: of the lens.
+    """
+    pixels = events.y.astype(np.intp) * events.width_px + events.x
+    counts = np.bincount(pixels, minlength=events.width_px * events.height_px).astype(np.float32)
+    # A flickering pixel counts no more than an edge's.
+    strongest = max(float(np.percentile(counts[counts > 0], _CLIP_PERCENTILE)), 1.0) if len(events) else 1.0
+    strength = np.minimum(counts.reshape(events.height_px, events.width_px) / strongest, 1.0)
+    return _pyramid((strength, strength), focal_px, 1)
+
+
+def _pyramid(strengths: Sequence[NDArray[np.float32]], focal_px: float, reduction: int) -> EdgePyramid:
+    """Build the fields of upright and of level edges, of given strength, at all widths."""
     levels = []
     for sigma_rad in SIGMAS_RAD:
         further = 1

@@ -1,60 +1,61 @@
 """Kinds of findings of a scene's edges, and of boards in view, on deployed extrinsics."""
 
-import math
-
-from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.phrasing import fill
+from lce_rig.core.findings import Kind
 
 _BOARD = "collect a session with the board and calibrate it"
 _FASTEN = f"fasten the sensors, {_BOARD}"
 _UNSEEN = "changes below {smallest:size} would not be seen"
+_SEEN = "changes from {smallest_deg:deg}, {smallest_m:mm} would be seen"
 _RECORD = "record furniture, doors or people that stand before something farther off"
 
-STATES = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
-"""Words for the state of an axis."""
+STATES = {"unchanged": "holds", "changed": "changed", "unknown": "cannot tell"}
+"""Words for a verdict."""
 
-
-def _axis_changed(finding: Finding) -> str:
-    """Scene, {subject}: changed by {change:size} +- {sigma:size}, or instead: {instead}; {smallest:size}."""
-    instead = ", or instead: {instead:motion}" if finding.figures["instead"] else ""
-    text = "scene, {subject:motion}: changed by {change:+size} +- {sigma:size}" + instead
-    return fill(text, {"subject": finding.subject, **finding.figures})
-
-
-def _large_scatter(finding: Finding) -> str:
-    """Scene, {subject}: changes below {smallest:size} would not be seen; {change:size}, {sigma:size}."""
-    is_blind = math.inf in (finding.figures.get("smallest_m"), finding.figures.get("smallest_deg"))
-    text = "parts of the scene do not agree on any change" if is_blind else _UNSEEN
-    return fill(f"scene, {{subject:motion}}: {text}", {"subject": finding.subject, **finding.figures})
-
-
-UNCHANGED = Kind(
-    "scene.unchanged", "the extrinsics fit the edges of the scene in {n_captures} captures", severity="note"
+UNCHANGED = Kind("scene.unchanged", f"scene: the edges fit, {_SEEN}", severity="note")
+CHANGED = Kind(
+    "scene.changed",
+    "scene: changed by {rotation_deg:deg} +- {sigma_deg:deg}, {translation_m:mm} +- {sigma_m:mm}: "
+    "{axes:motion}",
+    _FASTEN,
 )
-CHANGED = Kind("scene.changed", "the extrinsics do not fit the edges of the scene: {changed:motion}", _FASTEN)
+ELSEWHERE = Kind(
+    "scene.elsewhere",
+    "scene: changed, the edges fit best {rotation_deg:deg}, {translation_m:mm} away, elsewhere about as well",
+    _FASTEN,
+)
+DOUBTFUL = Kind(
+    "scene.doubtful",
+    "scene: the edges fit other extrinsics slightly better, which chance may explain",
+    "record more places",
+    severity="warning",
+)
 UNKNOWN = Kind(
     "scene.unknown",
-    "the edges of the scene cannot tell: {unknown:motion}",
+    "scene: the edges cannot tell below {smallest_deg:deg}, {smallest_m:mm}",
     _RECORD,
     severity="warning",
 )
 FEW_EDGES = Kind(
     "scene.few_edges",
-    "{n_edges} edges of the scene in {n_captures} captures are too few or too close together",
+    "scene: {n_edges} edges in {n_captures} captures are too few",
     _RECORD,
 )
-UNCHANGED_WITH_BOARD = Kind(
-    "scene.unchanged_with_board",
-    "the extrinsics fit: the scene of {n_captures} captures, or the board in {n_boards}, covers each axis",
-    severity="note",
+WEAK = Kind(
+    "scene.weak",
+    "scene: no extrinsics near these fit the edges clearly",
+    "check that the result is of this rig, and images sharp and lit",
+    severity="warning",
 )
-CHANGED_WITH_BOARD = Kind(
-    "scene.changed_with_board", "the extrinsics do not fit the scene or the board: {changed:motion}", _FASTEN
+AMBIGUOUS = Kind(
+    "scene.ambiguous",
+    "scene: several extrinsics fit the edges about equally well",
+    "record more places",
+    severity="warning",
 )
-UNKNOWN_WITH_BOARD = Kind(
-    "scene.unknown_with_board",
-    "neither the scene nor the board can tell: {unknown:motion}",
-    _RECORD,
+BEYOND_REACH = Kind(
+    "scene.beyond_reach",
+    "scene: the best fit is at the border of the region searched",
+    _BOARD,
     severity="warning",
 )
 BOARD_CHANGED = Kind(
@@ -80,8 +81,7 @@ BOARD_UNSURE = Kind(
 )
 CONTRADICTION = Kind(
     "scene.contradiction",
-    "scene and boards contradict each other, {subject:motion}: scene {change:+size} +- {sigma:size}, "
-    "boards {board:+size} +- {board_sigma:size}",
+    "scene and boards contradict each other: they differ by {rotation_deg:deg}, {translation_m:mm}",
     "check clocks and intrinsics, and collect a session with the board",
     severity="warning",
 )
@@ -113,24 +113,5 @@ EVENTS_OF_STANDING_RIG = Kind(
     "scene.events_of_standing_rig",
     "{subject} is judged by events, which show only moving things, and the rig was not seen to move",
     "move the rig slowly past upright edges, or record images as well",
-    severity="warning",
-)
-AXIS_UNCHANGED = Kind(
-    "scene.axis_unchanged", "scene, {subject:motion}: no change of {smallest:size} or more", severity="note"
-)
-AXIS_CHANGED = Kind("scene.axis_changed", _axis_changed)
-LARGE_SCATTER = Kind(
-    "scene.large_scatter", _large_scatter, "record more places or more upright edges", severity="warning"
-)
-FLAT = Kind(
-    "scene.flat",
-    "scene, {subject:motion}: no extrinsics along this axis fit the edges clearly",
-    "check that the result is of this rig, and images sharp and lit",
-    severity="warning",
-)
-NO_PEAK = Kind(
-    "scene.no_peak",
-    "scene, {subject:motion}: the best fit is at the end of the range searched",
-    _BOARD,
     severity="warning",
 )

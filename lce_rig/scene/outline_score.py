@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, perturb, skew, transform
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
+from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid, build_event_pyramid
 from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outlines
 
 _BESIDE_RAD = 0.06  # Margin of the image in which outlines are kept: other extrinsics bring them in.
@@ -35,13 +35,13 @@ class OutlineView:
 
 
 def build_outline_view(
-    capture: str, image: Image, scan: Scan, beam: Beam, intrinsics: Intrinsics, T_cam_lidar: Array
+    capture: str, image: Image | Events, scan: Scan, beam: Beam, intrinsics: Intrinsics, T_cam_lidar: Array
 ) -> OutlineView:
     """Find the edges of a scan near the image, and those of the image.
 
     Args:
         capture: name of the view.
-        image: of the camera.
+        image: of the camera, or its events about the scan.
         scan: of the LiDAR.
         beam: of the LiDAR.
         intrinsics: of the camera.
@@ -53,7 +53,11 @@ def build_outline_view(
     outlines = find_outlines(scan.points[near], scan.intensity[near], beam)
     if len(outlines) > _MAX_EDGES:
         outlines = outlines.select(np.linspace(0, len(outlines) - 1, _MAX_EDGES).round().astype(np.intp))
-    return OutlineView(capture, outlines, build_edge_pyramid(image.grey, intrinsics.fx_px))
+    if isinstance(image, Image):
+        pyramid = build_edge_pyramid(image.grey, intrinsics.fx_px)
+    else:
+        pyramid = build_event_pyramid(image, intrinsics.fx_px)
+    return OutlineView(capture, outlines, pyramid)
 
 
 class OutlineScore:

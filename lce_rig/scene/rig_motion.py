@@ -10,8 +10,8 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, exp_so3, log_so3
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.scene.alignment import Alignment, Curve, SceneView
-from lce_rig.scene.drift import NEARLY
+from lce_rig.scene.edge_pyramid import SIGMAS_RAD
+from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 
 # Scans of a standing rig differ by less in a tenth of a second: noise, and people who pass by.
 _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
@@ -25,6 +25,8 @@ _CLOCKS_S = np.linspace(-0.15, 0.15, 31)
 # Clocks nearer to each other than this are not told from motion that is not quite constant.
 _APART_S = 0.02
 _APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
+# Share of the score below which clocks explain images less well than changed extrinsics do.
+_NEARLY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +114,7 @@ def firing_times_s(scan: Scan, points: Array) -> Array | None:
 class MovingView:
     """A capture of a moving rig, its edges as they were at the image's time, and the motion."""
 
-    view: SceneView
+    view: OutlineView
     motion: RigMotion
 
 
@@ -121,7 +123,7 @@ def clocks_apart_s(
 ) -> float | None:
     """Find by how much images come later than their timestamps say, from captures of a moving rig.
 
-    The score is searched along the time of the images as along an axis of the extrinsics.
+    The score is searched along the time of the images, at the finest width of the fields.
 
     Args:
         views: the captures.
@@ -137,16 +139,33 @@ def clocks_apart_s(
     for after_s in _CLOCKS_S:
         later = []
         for each in views:
-            edges = each.view.edges
-            points = each.motion.moved(edges.points, np.full(len(edges), after_s))
-            later.append(replace(each.view, edges=replace(edges, points=points)))
-        alignment = Alignment(later, intrinsics, T_cam_lidar)
-        rows.append(alignment.split(alignment.shares(T_cam_lidar)))
-    curve = Curve(_CLOCKS_S, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+            outlines = each.view.outlines
+            points = each.motion.moved(outlines.points, np.full(len(outlines), after_s))
+            later.append(replace(each.view, outlines=replace(outlines, points=points)))
+        score = OutlineScore(later, intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
+        rows.append(score.edges(np.zeros(6))[0])
+    at_once = OutlineScore([each.view for each in views], intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
+    block = at_once.blocks(at_once.edges(np.zeros(6))[2])
+    by_block = np.array([np.bincount(block, row, N_BLOCKS) for row in rows])[:, np.unique(block)]
+    total = by_block.sum(axis=1)
     if T_changed is not None:
-        at_once = Alignment([each.view for each in views], intrinsics, T_cam_lidar)
-        if curve.total.max() < (1 - NEARLY) * at_once.shares(T_changed).sum():
+        changed = OutlineScore([each.view for each in views], intrinsics, T_changed, len(SIGMAS_RAD) - 1)
+        if total.max() < (1 - _NEARLY) * changed.value(np.zeros(6)):
             return None
-    peak_s = curve.peak
-    is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * curve.sigma())
-    return peak_s if is_apart and curve.significance(peak_s, 0.0) > _APART_SIGNIFICANCE else None
+    peak_s = float(_peaks(total[:, None])[0])
+    n = by_block.shape[1]
+    without = _peaks(total[:, None] - by_block)  # jackknife over the blocks of the image
+    sigma_s = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+    gains = by_block[total.argmax()] - by_block[len(_CLOCKS_S) // 2]
+    significance = gains.sum() / max(np.linalg.norm(gains), 1e-12)
+    is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * sigma_s)
+    return peak_s if is_apart and significance > _APART_SIGNIFICANCE else None
+
+
+def _peaks(columns: Array) -> Array:
+    """Find the time of the highest value of each column (K, N), between grid points by a parabola."""
+    index = np.clip(columns.argmax(axis=0), 1, len(_CLOCKS_S) - 2)
+    before, at, after = (columns[index + shift, np.arange(columns.shape[1])] for shift in (-1, 0, 1))
+    bend = np.minimum(before - 2 * at + after, -1e-12)
+    step = np.clip(0.5 * (before - after) / bend, -1, 1)
+    return np.asarray(_CLOCKS_S[index] + step * (_CLOCKS_S[1] - _CLOCKS_S[0]))

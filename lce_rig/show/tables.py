@@ -6,19 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.core.calibration import AxisDrift, Calibration, RigPoses, SceneOpinion
-from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
+from lce_rig.core.calibration import Calibration, RigPoses, SceneOpinion
+from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes, tangent_sizes
 from lce_rig.core.phrasing import sizes
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words
-from lce_rig.scene.findings import STATES
 
 Row = Sequence[str]
 _STEP = 1e-6
-_AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _SCENE = {"agrees": "agree with the extrinsics", "contradicts": "contradict the extrinsics"}
-# Along such an axis there is no best fit, and so no change that would have been seen.
-_WITHOUT_FIT = ("scene.flat", "scene.no_peak")
 
 
 class Table(NamedTuple):
@@ -56,7 +52,6 @@ def result_tables(c: Calibration) -> dict[str, Table]:
     ]
     cameras = ("camera", "captures", "1 sigma", "images differ by", "boards apart")
     refused = [(name, why.stage, why.sentence) for name, why in c.captures_refused.items()]
-    scene = () if c.scene is None else c.scene.axes
     return {
         "pose": Table(pose, ("", "value", "1 sigma"), _pose_rows(c)),
         "points": Table("Error of a LiDAR point", ("distance", "middle of image", "worst corner"), points),
@@ -66,7 +61,6 @@ def result_tables(c: Calibration) -> dict[str, Table]:
         "captures": Table("Captures", ("capture", *_FIGURES), _capture_rows(c)),
         "refused": Table("Captures that were not used", ("capture", "stage", "cause and action"), refused, 3),
         "channels": Table("Channels", ("", *(r.channel for r in c.channel_results)), _channel_rows(c)),
-        "scene": axis_table("Scene", scene),
         "cameras": Table("Other cameras that saw the same boards", cameras, _camera_rows(c)),
     }
 
@@ -184,23 +178,13 @@ def _channel_rows(c: Calibration) -> list[Row]:
 
 
 def scene_words(opinion: SceneOpinion) -> str:
-    """State whether the edges of the room agree with extrinsics."""
+    """State whether the edges of the room agree with extrinsics, and which change fits best."""
     data = f"{opinion.n_captures} captures, {opinion.n_edges} edges, without those of the board"
-    return f"the edges of the room {_SCENE.get(opinion.state, 'cannot tell')} ({data})"
-
-
-def axis_table(title: str, axes: Sequence[AxisDrift]) -> Table:
-    """State for each axis whether it changed, by how much, and the smallest change that would be seen."""
-    rows = []
-    for axis in axes:
-        scale, digits, kind = (1.0, 2, "about") if axis.unit == "deg" else (1000.0, 0, "along")
-        unit = "deg" if axis.unit == "deg" else "mm"
-        change = smallest = "-"
-        if math.isfinite(axis.sigma) and axis.reason not in _WITHOUT_FIT:
-            change = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f} {unit}"
-            smallest = f"{scale * axis.smallest:.{digits}f} {unit}" if math.isfinite(axis.smallest) else "-"
-        rows.append((f"{kind} {_AXES[axis.axis[-1]]}", STATES[axis.state], change, smallest))
-    return Table(title, ("axis", "", "fits best at", "would see"), rows, 2)
+    fit = ""
+    if opinion.change is not None and opinion.cov is not None:
+        change, sigma = sizes(*tangent_sizes(opinion.change)), sizes(*sigma_sizes(opinion.cov))
+        fit = f": they fit best {change} away, 1 sigma {sigma}"
+    return f"the edges of the room {_SCENE.get(opinion.state, 'cannot tell')}{fit} ({data})"
 
 
 def _camera_rows(c: Calibration) -> list[Row]:

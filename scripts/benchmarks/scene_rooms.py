@@ -17,7 +17,7 @@ from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.profile import NominalExtrinsic
-from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.outline_score import OutlineView
 from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
@@ -63,7 +63,7 @@ class FurnishedRoom:
         (calibration,), _ = calibrate_detections(self.rig, self.detections)
         return calibration
 
-    def views(self, calibration: Calibration, *, ignore_board: bool = False) -> list[SceneView]:
+    def views(self, calibration: Calibration, *, ignore_board: bool = False) -> list[OutlineView]:
         """Find the edges of all captures, without those at the board if it is to be ignored."""
         views = []
         for capture in self.session.captures:

@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lce_rig.core.calibration import (
-    AxisDrift,
     Certificate,
     ChannelResult,
     Contribution,
@@ -66,7 +65,7 @@ def full():
         ),
         cov_shared=0.1 * cov,
         contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),
-        scene=SceneOpinion(2, 70, (AxisDrift("rotation_x", "unchanged", -0.1, 0.2, np.inf),)),
+        scene=SceneOpinion(2, 70, "agrees", np.full(6, 0.01), cov),
         board_distances_m=(1.5, 3.25),
     )
 
@@ -216,13 +215,14 @@ def test_files_of_earlier_versions_are_read(tmp_path):
     assert file.document()["pairs"][0]["reasons"] == [REASON]
 
 
-@pytest.mark.parametrize(("before", "now"), [("agrees", "unchanged"), ("contradicts", "changed")])
-def test_axes_of_the_scene_are_read_as_earlier_versions_called_them(tmp_path, before, now):
+def test_scene_of_earlier_version_keeps_its_state(tmp_path):
+    axis = {"axis": "rotation_x", "state": "unchanged", "change": -0.1, "sigma": 0.2, "smallest": None}
+
     def as_before(document):
-        document["pairs"][0]["scene"]["axes"][0] |= {"state": before, "unit": "deg"}
+        document["pairs"][0]["scene"] = {"state": "agrees", "n_captures": 2, "n_edges": 7, "axes": [axis]}
 
     (pair,) = read_result(edited(tmp_path / "result.json", as_before)).pairs
-    assert pair.scene.axes[0].state == now
+    assert (pair.scene.state, pair.scene.n_edges, pair.scene.change) == ("agrees", 7, None)
 
 
 def test_findings_of_another_version_keep_their_words(tmp_path):

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
+from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, State
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.board_drift import BoardDrift, JointDrift, watch_boards
+from lce_rig.judge.board_drift import AxisDrift, BoardDrift, JointDrift, watch_boards
+from lce_rig.judge.scene_drift import SceneDrift
 from lce_rig.pipeline.pair_drift import PairDrift
 from lce_rig.rig import load_rig
-from lce_rig.scene.drift import Drift
+from lce_rig.scene.estimate import REACH, SceneEstimate
 from tests.calibrate.boards import T_FORWARD, Scenario, simulate
 from tests.saved_results import made_calibration
 
@@ -61,19 +62,19 @@ def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
     return tuple(found)
 
 
-@pytest.mark.parametrize(("board_deg", "state"), [(0.10, "unknown"), (0.45, "changed")])
+@pytest.mark.parametrize(("board_deg", "state"), [(0.10, "unknown"), (0.9, "changed")])
 def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float, state: State) -> None:
     calibration = deployed(np.zeros(6))
-    scene = axes({"rotation_z": ("changed", 0.54)})
-    drift = Drift(scene, (), T_FORWARD, {}, 15, 4000)
-    joint = JointDrift(np.zeros(6), np.diag(SIGMAS**2), 2.5)
+    change, cov = np.radians(1.2) * np.eye(6)[5], np.diag(SIGMAS**2)
+    estimate = SceneEstimate(perturb(T_FORWARD, change), cov, "usable", 0.3, 5.0, 15, 4000, REACH)
+    drift = SceneDrift(T_FORWARD, cov, estimate, 15)
+    joint = JointDrift(np.radians(board_deg) * np.eye(6)[5], 4 * cov, 2.5)
     boards = BoardDrift(
         axes({"rotation_z": ("unchanged", board_deg)}), Metrics(0.01, 0.01, 0.1), 15, 15, joint
     )
     pair = PairDrift(calibration, drift, boards, None)
-    assert (pair.states["rotation_z"], pair.state) == (state, state)
-    contradicts = [finding.subject for finding in pair.findings if finding.code == "scene.contradiction"]
-    assert contradicts == (["rotation_z"] if state == "unknown" else [])
+    assert pair.state == state
+    assert (pair.findings[0].code == "scene.contradiction") == (state == "unknown")
 
 
 def test_watch_boards_one_outlier_keeps_the_verdict() -> None:

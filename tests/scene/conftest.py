@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.rig import Rig, load_rig
-from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.outline_score import OutlineView
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
@@ -24,7 +24,7 @@ class Seen(NamedTuple):
     rig: Rig
     captures: list[SimulatedCapture]
     truth: Calibration
-    views: list[SceneView]
+    views: list[OutlineView]
 
 
 def small_rig(name="rlfs"):

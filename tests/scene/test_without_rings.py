@@ -1,6 +1,7 @@
 """`drift` and the scene's opinion with a LiDAR that scans in no rings, against a simulated room's truth."""
 
 import json
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import pytest
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import exp_so3, perturb, pose
+from lce_rig.judge.scene_drift import watch_scene
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import load_rig
-from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from tests.saved_results import made_calibration, result_file, write_result
@@ -31,25 +32,22 @@ def seen():
 
 
 def judge(seen, tangent=(0.0,) * 6):
-    c = seen.truth
-    return watch(seen.views, seen.rig.lens_of(c), perturb(c.T_cam_lidar, np.array(tangent)), c.cov)
+    c = replace(seen.truth, T_cam_lidar=perturb(seen.truth.T_cam_lidar, np.array(tangent)))
+    return watch_scene(seen.views, seen.rig.lens_of(c), c)
 
 
-def test_the_truth_has_no_change(seen):
-    drift = judge(seen)
-    assert {axis.state for axis in drift.axes} <= {"unchanged", "unknown"}
-    assert {axis.axis for axis in drift.axes if axis.state == "unchanged"} >= {"translation_x", "rotation_y"}
+def test_scene_without_rings_truth_holds(seen):
+    assert judge(seen).state == "unchanged"
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("axis", MOTIONS)
-def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign):
+def test_scene_without_rings_changes_do_not_hold(seen, axis, sign):
     size = sign * (np.radians(1.0) if axis.startswith("rotation") else 0.1)
     drift = judge(seen, size * np.eye(6)[MOTIONS.index(axis)])
     assert drift.state != "unchanged"
     if axis in ("rotation_y", "translation_x"):
-        (change,) = [each for each in drift.axes if each.state == "changed"]
-        assert axis in (change.axis, *change.instead)
+        assert axis in drift.findings[0].figures["axes"]
 
 
 @pytest.mark.long
@@ -60,7 +58,7 @@ def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, ca
     write_result(tmp_path / "room" / "calibration" / "result.json", seen.rig.name, [seen.truth])
     assert run(["drift", str(tmp_path / "room"), "--json"]) in (0, 6)
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
-    assert pair["n_edges"] > 300 and pair["scene_state"] != "changed"
+    assert pair["scene"]["n_edges"] > 300 and pair["scene"]["state"] != "changed"
     session = Session.open(tmp_path / "room")
     assert hear_scene(session, detect(session), seen.truth).state in ("agrees", "unknown")
 
@@ -86,7 +84,7 @@ def drives(recordings):
 @pytest.mark.dataset
 @pytest.mark.parametrize("axis", [None, *range(6)])
 def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged(drives, axis):
-    for views in list(combinations(drives.views, 3))[::7]:
+    for views in list(combinations(drives.views, 3))[::31]:
         three = drives._replace(views=list(views))
         if axis is None:
             assert judge(three).state != "changed"
@@ -94,7 +92,7 @@ def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged
         for sign in (-1, 1):
             size = sign * (0.2 if axis < 3 else np.radians(1.0))
             drift = judge(three, size * np.eye(6)[axis])
-            assert drift.state == "changed" or (axis == 5 and drift.state == "unknown")
+            assert drift.state != "unchanged"
 
 
 @pytest.mark.dataset
@@ -104,4 +102,4 @@ def test_drift_reads_a_folder_of_drives(drives, recordings, tmp_path, capsys):
     words = ["drift", folder, "--rig", str(KITTI), "--result", result]
     assert run([*words, "--json"]) == 0
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
-    assert pair["n_captures"] == 7 and pair["state"] == "unchanged"
+    assert pair["scene"]["n_captures"] == 12 and pair["state"] == "unchanged"

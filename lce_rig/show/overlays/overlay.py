@@ -22,7 +22,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.session_check import SessionCheck
-from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.scene.outlines import Outlines
 from lce_rig.session import Capture, Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.show.overlays import canvas
@@ -94,9 +94,9 @@ def draw_projection(
 
 
 def draw_edges(
-    image: Image, edges: DepthEdges, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
+    image: Image, edges: Outlines, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
 ) -> Picture:
-    """Draw a scan's depth edges into the image under several extrinsics, side by side.
+    """Draw a scan's edges into the image under several extrinsics, side by side.
 
     Args:
         image: of the capture.
