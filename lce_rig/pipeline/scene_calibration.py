@@ -414,7 +414,6 @@ def _findings(
         )
     if nominal.source == "typical":
         yield SCENE_TYPICAL(subject)
-    for finding in nominal_findings(estimate.T_cam_lidar, nominal):
-        yield replace(finding, severity="warning")
+    yield from nominal_findings(estimate.T_cam_lidar, nominal)
     if n_moving:
         yield SCENE_MOVING(subject, severity="note", n_views=n_moving)

@@ -133,10 +133,10 @@ def test_sigma_beyond_target_is_marginal(panels, tmp_path):
     assert verdict_of(panels, tmp_path, rig) == ("marginal", {"scene_calibration.uncertain"})
 
 
-def test_far_from_cad_is_marginal(panels, tmp_path):
+def test_far_from_cad_fails(panels, tmp_path):
     entry = nominal(perturb(TRUTH, OFF)) | {"tolerance_m": 0.01}
     rig = rig_of(entry, target_sigma_m=0.2, target_sigma_deg=2.0)
-    assert verdict_of(panels, tmp_path, rig) == ("marginal", {"verdict.far_from_nominal"})
+    assert verdict_of(panels, tmp_path, rig) == ("fail", {"verdict.far_from_nominal"})
 
 
 def dark(image):
