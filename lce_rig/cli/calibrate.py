@@ -267,8 +267,8 @@ def _calibrate_scene(
     found.require_pairs()
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
-    if result.session.path != path and name is None:
-        name = "scene"
+    if name is None and result.session.path == scene[0]:
+        name = BY_SCENE  # The result of its boards stays.
     written = result.write(name=name, force=force, report=False)
     if as_json:
         show.print_json(result.document())

@@ -174,7 +174,7 @@ def calibrate_scene(
     drawn: list[Drawn] = []
     for done, nominal in enumerate(nominals):
         progress(done, len(nominals))
-        found, shown = _calibrate_pair(opened.rig, nominal, views)
+        found, shown = calibrate_pair(opened.rig, nominal, views)
         if isinstance(found, Calibration):
             pairs.append(found)
         else:
@@ -303,7 +303,7 @@ def _stored(session: Session) -> Iterator[View]:
             yield View(capture.name, images, tuple(map(capture.scan, capture.lidars)), {})
 
 
-def _calibrate_pair(
+def calibrate_pair(
     rig: Rig, nominal: NominalExtrinsic, views: Sequence[View]
 ) -> tuple[Calibration | Finding, list[Drawn]]:
     """Estimate and judge the extrinsics of one camera and LiDAR; a finding where the scene cannot tell."""

@@ -11,6 +11,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError
 from lce_rig.core.geometry import difference, perturb
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.pipeline.scene_calibration import calibrate_scene
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.session import Session
@@ -106,11 +107,23 @@ def test_folder_again_keeps_captures(drive, tmp_path):
     assert len(Session.open(tmp_path / "out").captures) == 3
 
 
-def test_session_keeps_its_own_result(panels, tmp_path, capsys):
-    path = session_of(tmp_path / "own", panels)
-    assert run(["calibrate", "--scene", str(path), "--json"]) == 0
+def test_session_keeps_its_own_result(panels, tmp_path, capsys, monkeypatch):
+    path = session_of(tmp_path / "session", panels)
+    monkeypatch.chdir(tmp_path)
+    assert run(["calibrate", "--scene", "session", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["pairs"][0]["method"] == "scene"
     assert (path / "results" / "scene" / "result.json").exists() and not (path / "calibration").exists()
+
+
+def test_bag_is_read_as_a_folder_is(panels, tmp_path):
+    with BagRecorder(tmp_path / "drive.bag", RIG) as bag:
+        for second, (image, scan) in enumerate(panels):
+            # Images in the middle of scans.
+            bag.write(replace(scan, stamp_ns=(second + 1) * 10**9))
+            bag.write(replace(image, stamp_ns=(second + 1) * 10**9 + 500_000_000))
+    found = calibrate_scene([tmp_path / "drive.bag"], tmp_path / "out", rig=RIG)
+    (c,) = found.result.pairs
+    assert len(c.captures_used) == 3 and chi2(c) < 16.81
 
 
 def verdict_of(panels, tmp_path, rig):
