@@ -20,7 +20,7 @@ from lce_rig.cli.options import (
 )
 from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, RigPoses
-from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError, join_shortages
 from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
@@ -29,6 +29,8 @@ from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
 from lce_rig.pipeline.detect_session import unlike_models
 from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
+from lce_rig.pipeline.scene_calibration import METHOD as BY_SCENE
+from lce_rig.pipeline.scene_calibration import calibrate_scene
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
 from lce_rig.show.tables import result_tables, rig_table
@@ -62,7 +64,9 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
     along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
     by_axis = (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm"))
-    for title, values, digits, unit in by_axis if is_by_axis and c.verdict == "pass" else ():
+    for title, values, digits, unit in (
+        by_axis if is_by_axis and (c.verdict == "pass" or c.method == BY_SCENE) else ()
+    ):
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
     for point in c.uncertainty:
@@ -113,6 +117,13 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     "one; the earlier one stays beside it as rig-1.yaml. With --name, only that result gets it, in its "
     "folder, and the session keeps its own.",
 )
+@path_option(
+    "--scene",
+    "DRIVE",
+    "Without a board: correct the nominal extrinsics of --rig by the edges of this recording (repeatable), "
+    "whose views become SESSION. A session's own result is then --name [default: scene].",
+    multiple=True,
+)
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
@@ -126,6 +137,7 @@ def calibrate(
     robot: str | None,
     without: list[str] | None,
     profile: str | None,
+    scene: tuple[Path, ...],
     explain: bool,
     as_json: bool,
     force: bool,
@@ -142,6 +154,15 @@ def calibrate(
     with 6 if a camera has no result.
     """
     result_folder(Path(), name, is_new=True)
+    if scene:
+        if channels is not None or without or reference is not None or robot is not None:
+            raise UsageError(
+                "--scene takes no --channels, --without, --reference or --robot", "Omit the option."
+            )
+        _calibrate_scene(
+            scene, session, profile, cameras, name, explain=explain, as_json=as_json, force=force
+        )
+        return
     if profile is not None and name is None:
         _take_profile(session, profile)
     if without:
@@ -217,6 +238,49 @@ def calibrate(
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
+
+
+def _calibrate_scene(
+    scene: tuple[Path, ...],
+    path: Path,
+    profile: str | None,
+    cameras: tuple[str, ...],
+    name: str | None,
+    *,
+    explain: bool,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Estimate extrinsics from a drive, write them, and print them."""
+    rig = None if profile is None else lce.load_rig(profile)
+    if rig is not None:
+        require_sensors("camera", cameras, rig.cameras)
+    with show.progress_bar("reading") as progress:
+        found = calibrate_scene(scene, path, rig=rig, cameras=cameras, progress=progress)
+    for text in found.notes:
+        show.note(text)
+    result = found.result
+    with show.progress_bar("drawing"):
+        pictures = found.write_overlays()
+    if pictures:
+        show.note(f"  overlays     {pictures[0].parent}/ ({show.counted(len(pictures), 'image')})")
+    found.require_pairs()
+    for shortage in result.shortages:
+        show.warn(str(NotEnoughDataError.of(shortage)))
+    if name is None and result.session.path == scene[0]:
+        name = BY_SCENE  # The result of its boards stays.
+    written = result.write(name=name, force=force, report=False)
+    if as_json:
+        show.print_json(result.document())
+    else:
+        show_result(
+            result.pairs, result.on_base, result.session.rig, str(result.session.path), is_explained=explain
+        )
+    show.warn_of(finding for finding in written.findings if finding.severity != "note")
+    show.note(f"  files        {written.files[0].parent}/ ({len(written.files) - 1} for the robot)")
+    exit_by_verdict(result.pairs, are_printed=not as_json)
+    if result.shortages:
+        raise join_shortages([NotEnoughDataError.of(each) for each in result.shortages])
 
 
 def collect_command(session: lce.Session) -> str:
@@ -335,7 +399,7 @@ def _parts(
     earlier = list(dict.fromkeys(told[each.text] for each in causes if each.text in told))
     fresh = [each for each in causes if each.text not in told]
     told |= {each.text: pair for each in fresh}
-    used = f"{len(c.captures_used)} of {c.n_captures} captures used"
+    used = f"{len(c.captures_used)} of {c.n_captures} {'views' if c.method == BY_SCENE else 'captures'} used"
     yield f"[bold]{pair}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
     # A line counts those that are not shown.

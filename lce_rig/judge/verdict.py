@@ -105,7 +105,9 @@ def judge(
         *_times(estimate, rig, camera),
         *residuals_beyond(estimate.metrics, rig.quality),
         *_captures(estimate, n_captures, rig.quality),
-        *_nominal(estimate.T_cam_lidar if T_view is None else invert(T_view) @ estimate.T_cam_lidar, nominal),
+        *nominal_findings(
+            estimate.T_cam_lidar if T_view is None else invert(T_view) @ estimate.T_cam_lidar, nominal
+        ),
         *_precision(estimate, examination, rig),
     ]
     return _verdict(_once(_explained(findings, examination)), examination.cov)
@@ -284,7 +286,8 @@ def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySet
         yield FEW_PLACEMENTS(n_used=n_used, n_placements=n_placements, n_needed=limits.min_captures)
 
 
-def _nominal(T: Array, nominal: NominalExtrinsic | None) -> list[Finding]:
+def nominal_findings(T: Array, nominal: NominalExtrinsic | None) -> list[Finding]:
+    """List the difference of extrinsics (4, 4) from the CAD pose, if it exceeds the tolerance."""
     if nominal is None or nominal.source == "typical":
         return []
 

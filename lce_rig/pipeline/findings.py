@@ -110,3 +110,72 @@ OTHER_PROFILE = Kind(
     "calibrate again if lens, board or mounting were changed",
     severity="warning",
 )
+_PLACES = "record more places with doors, poles or furniture before a far wall"
+SCENE_NO_VIEWS = Kind(
+    "scene_calibration.no_views",
+    "no image within the tolerance of a scan",
+    "check the topics and timestamps of the recording",
+    severity="warning",
+)
+SCENE_MOVING = Kind(
+    "scene_calibration.moving",
+    "{n_views} views of a moving rig are not used: scans or images have no times",
+    "record points with their firing times, or let the rig stand",
+    severity="warning",
+)
+SCENE_DARK = Kind(
+    "scene_calibration.dark",
+    "cannot tell: images are dark, 99 % of the pixels below grey {grey_99:.0f} (minimum {limit:.0f})",
+    "record by daylight, or expose longer",
+    severity="warning",
+)
+SCENE_FEW_EDGES = Kind(
+    "scene_calibration.few_edges",
+    "cannot tell: {n_edges} edges of the scene in {n_views} views are too few",
+    _PLACES,
+    severity="warning",
+)
+SCENE_WEAK = Kind(
+    "scene_calibration.weak",
+    "cannot tell: edges of images and scans do not match near the nominal pose in {n_views} views, "
+    "score {score:.2f} (minimum {min_score:.2f})",
+    "check nominal_extrinsics, intrinsics, camera names, and timestamps",
+    severity="warning",
+)
+SCENE_AMBIGUOUS = Kind(
+    "scene_calibration.ambiguous",
+    "cannot tell: two poses fit the edges of {n_views} views nearly as well",
+    _PLACES,
+    severity="warning",
+)
+SCENE_BEYOND_REACH = Kind(
+    "scene_calibration.beyond_reach",
+    "cannot tell: the best fit is more than {reach_deg:1deg} or {reach_m:mm} from the nominal pose",
+    "correct nominal_extrinsics, and check intrinsics and the camera's name",
+    severity="warning",
+)
+SCENE_LENS = Kind(
+    "scene_calibration.lens",
+    "cannot tell: edges fit better with focal lengths changed by {change:+.0f} % in {n_views} views",
+    "correct the intrinsics: those of this lens at this image size",
+    severity="warning",
+)
+SCENE_UNDETERMINED = Kind(
+    "scene_calibration.undetermined",
+    "cannot tell: the scene of {n_views} views does not determine {axes:motion}",
+    _PLACES,
+    severity="warning",
+)
+SCENE_UNCERTAIN = Kind(
+    "scene_calibration.uncertain",
+    "uncertainty {sigma_deg:deg}, {sigma_m:mm} (target {target_deg:deg}, {target_m:mm}), largest in "
+    "{weakest:motion}",
+    "record more places, or calibrate with a board",
+    severity="warning",
+)
+SCENE_TYPICAL = Kind(
+    "scene_calibration.typical",
+    "nothing confirms the result: nominal_extrinsics is typical of such rigs, not of this one",
+    "enter the CAD model's pose with `source: cad`",
+    severity="warning",
+)

@@ -169,7 +169,7 @@ class Mount(Settings):
 
 
 class NominalExtrinsic(Settings):
-    """The expected pose of a camera; compared with the result, never used as an initial guess.
+    """The expected pose of a camera; compared with the result, an initial guess of `calibrate --scene` alone.
 
     It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
     is given in exactly one way.

@@ -124,7 +124,9 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
 
 
 def _fit_rows(c: Calibration) -> list[Row]:
-    """State residuals and certificate."""
+    """State residuals and certificate; none without boards."""
+    if not math.isfinite(c.metrics.mpe_m):
+        return []
     first = c.camera if c.is_of_peers else "the camera"
     points = f"corners by {c.lidar}" if c.is_of_cameras else "LiDAR points"
     start = "start of the estimate (Algorithm 1)" if c.is_start_certified else "result"

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core.calibration import MOTIONS, ResultFile
-from lce_rig.core.geometry import perturb
+from lce_rig.core.geometry import difference, perturb
+from lce_rig.pipeline.scene_calibration import View, calibrate_pair
 from lce_rig.pipeline.watch_drift import SceneCaptures
+from lce_rig.rig import NominalExtrinsic
 from lce_rig.scene.rig_motion import estimate_motion
 from lce_rig.timing.scan_pairing import Frame
 from tests.scene.conftest import deployed, small_rig
@@ -109,3 +111,28 @@ def test_scans_without_firing_times_are_not_used_while_moving(driven):
     drift = watch_captures(driven, change=lambda scan: replace(scan, offset_ns=None))
     assert drift.n_captures == 0 and drift.state == "unknown"
     assert [f.figures["n_captures"] for f in drift.findings if f.code == "scene.no_firing_times"] == [6]
+
+
+def calibrated(driven, change=lambda scan: scan):
+    rig = driven[0][0]
+    off = perturb(rig.truth("cam", "lidar"), np.array([0.04, -0.03, 0.03, 0.008, -0.008, 0.006]))
+    nominal = NominalExtrinsic(
+        camera="cam", lidar="lidar", matrix=off[:3, :3].tolist(), translation_m=off[:3, 3].tolist()
+    )
+    views = [
+        View(str(k), (image,), (change(scan),), {"lidar": before})
+        for k, (_, before, scan, image) in enumerate(driven)
+    ]
+    return calibrate_pair(rig.stage.rig, nominal, views)[0]
+
+
+def test_scene_calibration_moves_edges_to_images(driven):
+    c = calibrated(driven)
+    tangent = difference(c.T_cam_lidar, driven[0][0].truth("cam", "lidar"))
+    assert tangent @ np.linalg.solve(c.cov, tangent) < 16.81
+    assert np.degrees(np.linalg.norm(tangent[3:])) < 0.3 and np.linalg.norm(tangent[:3]) < 0.03
+
+
+def test_scene_calibration_untimed_moving_is_no_result(driven):
+    found = calibrated(driven, lambda scan: replace(scan, offset_ns=None))
+    assert found.code == "scene_calibration.moving"

@@ -31,6 +31,7 @@ from lce_rig.show.page import render
 
 PAGE = "index.html"
 _WIDTH_IN = 16
+_TITLE_IN, _WIDE, _MANY = 0.3, 2.0, 600  # Height of a title; ratio of a wide image; edges drawn small.
 _FOLD_MARGIN = 0.9
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
@@ -96,7 +97,7 @@ def draw_projection(
 def draw_edges(
     image: Image, edges: Outlines, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
 ) -> Picture:
-    """Draw a scan's edges into the image under several extrinsics, side by side.
+    """Draw a scan's edges into the image under several extrinsics, side by side; wide images are stacked.
 
     Args:
         image: of the capture.
@@ -110,14 +111,25 @@ def draw_edges(
     """
     from matplotlib.figure import Figure
 
-    height_in = _WIDTH_IN / len(poses) * image.pixels.shape[0] / image.pixels.shape[1]
-    figure: Any = Figure(figsize=(_WIDTH_IN, height_in + 0.3), dpi=100)
-    panes = figure.subplots(1, len(poses), squeeze=False)[0]
-    figure.subplots_adjust(0, 0, 1, height_in / (height_in + 0.3), wspace=0.01)
+    height_px, width_px = image.pixels.shape[:2]
+    n_rows, n_columns = (len(poses), 1) if width_px > _WIDE * height_px else (1, len(poses))
+    height_in = _WIDTH_IN / n_columns * height_px / width_px
+    figure: Any = Figure(figsize=(_WIDTH_IN, n_rows * (height_in + _TITLE_IN)), dpi=100)
+    panes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    top, gap = height_in / (height_in + _TITLE_IN), _TITLE_IN / height_in
+    figure.subplots_adjust(0, 0, 1, 1 - (1 - top) / n_rows, wspace=0.01, hspace=gap)
+    size, rim = (4.0, 1.0) if len(edges) < _MANY else (3.0, 0.2)
     for axes, (name, T_cam_lidar) in zip(panes, poses.items(), strict=True):
         canvas.show_image(axes, image.pixels)
         pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
-        axes.plot(*pixels[intrinsics.is_inside(pixels)].T, "o", color="magenta", markersize=4, mec="black")
+        axes.plot(
+            *pixels[intrinsics.is_inside(pixels)].T,
+            "o",
+            color="magenta",
+            markersize=size,
+            mec="black",
+            mew=rim,
+        )
         axes.set_axis_off()
         axes.set_title(f"{title}  {name}", loc="left")
     return canvas.rendered(figure)

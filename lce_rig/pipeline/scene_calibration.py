@@ -1,0 +1,419 @@
+"""Estimate extrinsics without a board: the profile's nominal pose, corrected by the edges of a scene.
+
+recordings -> views spread over them, stored as captures of a session -> estimate of each camera with each
+LiDAR -> checks, verdict, overlays
+"""
+
+import math
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lce_rig.core.calibration import MOTIONS, Calibration, Certificate, Metrics
+from lce_rig.core.data import Image, Sample, Scan
+from lce_rig.core.errors import (
+    NotEnoughDataError,
+    ProfileError,
+    SessionError,
+    SourceError,
+    join_shortages,
+)
+from lce_rig.core.findings import Finding, Losses
+from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.progress import Progress, begin, silent
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.io import open_recordings
+from lce_rig.io.folder import FolderRecording
+from lce_rig.io.recording import ContinuousRecording, check_overlap, join_recordings, require_sensors
+from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.verdict import nominal_findings, with_findings
+from lce_rig.pipeline.findings import (
+    SCENE_AMBIGUOUS,
+    SCENE_BEYOND_REACH,
+    SCENE_DARK,
+    SCENE_FEW_EDGES,
+    SCENE_LENS,
+    SCENE_MOVING,
+    SCENE_NO_VIEWS,
+    SCENE_TYPICAL,
+    SCENE_UNCERTAIN,
+    SCENE_UNDETERMINED,
+    SCENE_WEAK,
+)
+from lce_rig.pipeline.result_files import Result
+from lce_rig.rig import NominalExtrinsic, Rig
+from lce_rig.scene.estimate import MIN_SCORE, SceneEstimate, estimate_scene, find_better_focal
+from lce_rig.scene.outline_score import OutlineView, build_outline_view
+from lce_rig.scene.rig_motion import estimate_motion, firing_times_s
+from lce_rig.scene.views import evenly
+from lce_rig.session import Session
+from lce_rig.session.identity import MARKER
+from lce_rig.show.overlays.canvas import write_picture
+from lce_rig.show.overlays.overlay import draw_edges
+from lce_rig.timing.scan_pairing import pair_by_time, rig_time_ns
+
+METHOD, OVERLAYS = "scene", "scene"
+"""How result.json names the method; the session's folder of overlays."""
+_MOST_VIEWS = 16  # More views of one drive add time, and little information.
+_DARK = 40  # Grey value that 1 % of the pixels exceed in the brightest view: below it, images are dark.
+_SCENE = "scene"  # Key of a capture's data: its place in the recording.
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The samples of one time.
+
+    Attributes:
+        name: of the capture that holds them.
+        images, scans: of all sensors; scans as recorded.
+        previous: the scans before, by LiDAR; empty where the recording is not continuous.
+    """
+
+    name: str
+    images: tuple[Image, ...]
+    scans: tuple[Scan, ...]
+    previous: Mapping[str, Scan]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A view of one camera and LiDAR, as overlays show it: the outlines under the poses by name."""
+
+    camera: str
+    lidar: str
+    image: Image
+    view: OutlineView
+    poses: Mapping[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """Extrinsics from a scene.
+
+    Attributes:
+        result: the pairs, and for each other pair why the scene cannot tell; without any pair only these.
+        drawn: each view of each pair.
+        notes: what was assumed or could not be read, in words.
+    """
+
+    result: Result
+    drawn: tuple[Drawn, ...]
+    notes: tuple[str, ...]
+
+    def write_overlays(self) -> list[Path]:
+        """Draw each view's outlines under the nominal and the estimated pose, into SESSION/scene/.
+
+        Raises:
+            SessionError: a file cannot be written.
+        """
+        folder, rig = self.result.session.path / OVERLAYS, self.result.session.rig
+        shutil.rmtree(folder, ignore_errors=True)
+        files = []
+        for each in self.drawn:
+            lens = rig.cameras[each.camera].to_intrinsics()
+            title = f"{each.camera}, {each.lidar}  {each.view.capture}"
+            picture = draw_edges(each.image, each.view.outlines, lens, each.poses, title)
+            path = folder / f"{each.camera}_{each.lidar}_{each.view.capture}.png"
+            files.append(write_picture(path, picture))
+        return files
+
+    def require_pairs(self) -> None:
+        """Check that the scene determines a pair.
+
+        Raises:
+            NotEnoughDataError: it does not; the cause of each pair.
+        """
+        if not self.result.pairs:
+            raise join_shortages([NotEnoughDataError.of(each) for each in self.result.shortages])
+
+
+def calibrate_scene(
+    recordings: Sequence[Path | str],
+    session: Path | str,
+    *,
+    rig: Rig | None = None,
+    cameras: Sequence[str] = (),
+    progress: Progress = silent,
+) -> SceneResult:
+    """Estimate the extrinsics of every camera with every LiDAR from a scene without a board.
+
+    Args:
+        recordings: of one time: folders of images and point clouds, bags, files; or one session.
+        session: folder of the session that holds the views; is created. That of a session is the session.
+        rig: the profile; None for that of the session.
+        cameras: those to calibrate; empty for all.
+        progress: called with (done, total) views.
+
+    Raises:
+        ProfileError: no pair has a nominal pose.
+        SessionError: the session holds captures of a board, or cannot be written.
+        SourceError: a recording cannot be read.
+    """
+    paths = [Path(each) for each in recordings]
+    notes: list[str] = []
+    if len(paths) == 1 and (paths[0] / MARKER).exists():
+        opened = Session.open(paths[0])
+        opened = opened if rig is None else opened.with_profile(rig)
+        nominals = _nominals(opened.rig, cameras)
+        views = list(_stored(opened))
+    elif rig is None:
+        raise SessionError(f"{paths[0]} is not a session", "Name the profile of its rig with --rig.")
+    else:
+        nominals = _nominals(rig, cameras)
+        kept = _read(paths, rig, notes, progress)
+        views = _store(kept, rig, Path(session))
+        opened = Session.open(session)
+    begin(progress, "estimating")
+    pairs: list[Calibration] = []
+    shortages: list[Finding] = []
+    drawn: list[Drawn] = []
+    for done, nominal in enumerate(nominals):
+        progress(done, len(nominals))
+        found, shown = calibrate_pair(opened.rig, nominal, views)
+        if isinstance(found, Calibration):
+            pairs.append(found)
+        else:
+            shortages.append(found)
+        drawn += shown
+    return SceneResult(Result(opened, tuple(pairs), tuple(shortages)), tuple(drawn), tuple(notes))
+
+
+def _nominals(rig: Rig, cameras: Sequence[str]) -> list[NominalExtrinsic]:
+    """List the nominal poses of cameras on LiDARs.
+
+    Raises:
+        ProfileError: there is none.
+    """
+    found = [
+        nominal
+        for camera in cameras or rig.cameras
+        for lidar in rig.lidars
+        if (nominal := rig.nominal(camera, lidar)) is not None
+    ]
+    if not found:
+        raise ProfileError(
+            f"rig {rig.name!r}: nominal_extrinsics has no pose of {' or '.join(cameras or rig.cameras)} and "
+            f"{' or '.join(rig.lidars) or 'a LiDAR'}",
+            "Enter the pose in nominal_extrinsics, to 2 deg and 20 cm: the search starts there.",
+        )
+    return found
+
+
+class _Spread(list[View]):
+    """Views spread over a stream of unknown length: every one, then every second, and so on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._n_taken, self._stride = 0, 1
+
+    def take(self, view: View) -> None:
+        if self._n_taken % self._stride == 0:
+            self.append(view)
+        self._n_taken += 1
+        if len(self) > _MOST_VIEWS:
+            self[:] = self[::2]
+            self._stride *= 2
+
+
+def _read(paths: Sequence[Path], rig: Rig, notes: list[str], progress: Progress) -> list[View]:
+    """Read views of recordings; what is damaged is skipped with a note.
+
+    Raises:
+        SourceError: a recording cannot be read at all.
+    """
+    kept: list[View] = []
+    for recording in join_recordings(open_recordings(paths, rig), rig):
+        if isinstance(recording, FolderRecording):
+            kept += _of_folder(recording, notes, progress)
+        elif isinstance(recording, ContinuousRecording):
+            kept += _of_stream(recording, rig, progress)
+        notes += recording.notes
+    return kept
+
+
+def _of_folder(recording: FolderRecording, notes: list[str], progress: Progress) -> Iterator[View]:
+    chosen = evenly(recording.pairs, _MOST_VIEWS)
+    failures: list[SourceError] = []
+    for done, files in enumerate(chosen, start=1):
+        try:
+            images, scans, _ = files.read()
+            yield View(files.label, tuple(images), tuple(scans), {})
+        except SourceError as error:
+            failures.append(error)
+        progress(done, len(chosen))
+    if failures and len(failures) == len(chosen):
+        raise failures[0]
+    notes += [f"skipped: {error.what}" for error in failures]
+
+
+def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> list[View]:
+    require_sensors(recording, rig)
+    losses, kept = Losses(), _Spread()
+
+    def counted() -> Iterator[Sample]:
+        samples: Iterable[Sample] = check_overlap(recording.samples(), rig, recording.notes)
+        for done, sample in enumerate(samples, start=1):
+            yield sample
+            progress(min(done, recording.n_samples), recording.n_samples)
+
+    previous: dict[str, Scan] = {}
+    for frame in pair_by_time(counted(), rig, losses):
+        if frame.images and frame.scans:
+            kept.take(View(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, previous))
+        previous = {scan.sensor: scan for scan in frame.scans}
+    if not kept and losses.counts():
+        (why, n), *_ = losses.counts()
+        raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")
+    return kept
+
+
+def _store(views: Sequence[View], rig: Rig, path: Path) -> list[View]:
+    """Store views as captures of a session, and name them so; those that it holds stay.
+
+    Raises:
+        SessionError: the session is of another rig, holds captures of a board, or cannot be written.
+    """
+    if (path / MARKER).exists():
+        with Session.open(path, writable=True) as session:
+            if any(_SCENE not in capture.meta for capture in session.captures):
+                raise SessionError(
+                    f"{path} holds captures of a board",
+                    "Name another folder for the scene: `lce-rig calibrate --scene DRIVE --rig FILE FOLDER`.",
+                )
+            session.adopt(rig)
+    named = []
+    with Session.resume(path, rig) as session:
+        for view in views:
+            name = session.find_duplicate(view.images, view.scans)
+            name = name or session.add_capture(view.images, view.scans, {_SCENE: view.name})
+            named.append(replace(view, name=name))
+    return named
+
+
+def _stored(session: Session) -> Iterator[View]:
+    """Read views of a session, spread over it; damaged captures are skipped."""
+    for capture in evenly(session.captures, _MOST_VIEWS):
+        with suppress(SessionError):
+            images = tuple(capture.image(*key) for key in capture.image_keys)
+            yield View(capture.name, images, tuple(map(capture.scan, capture.lidars)), {})
+
+
+def calibrate_pair(
+    rig: Rig, nominal: NominalExtrinsic, views: Sequence[View]
+) -> tuple[Calibration | Finding, list[Drawn]]:
+    """Estimate and judge the extrinsics of one camera and LiDAR; a finding where the scene cannot tell."""
+    camera, lidar, T_nominal = nominal.camera, nominal.lidar, nominal.to_matrix()
+    lens, channel = rig.cameras[camera].to_intrinsics(), rig.cameras[camera].first_channel("frames")
+    settings = rig.lidars[lidar]
+    beam = Beam(settings.beam_aperture_m, settings.beam_divergence_rad)
+    outlined: list[OutlineView] = []
+    images: list[Image] = []
+    n_moving = 0
+    for view in views:
+        image = next((each for each in view.images if (each.sensor, each.channel) == (camera, channel)), None)
+        scan = next((rig.corrected(each) for each in view.scans if each.sensor == lidar), None)
+        if image is None or scan is None:
+            continue
+        outlines = build_outline_view(view.name, image, scan, beam, lens, T_nominal)
+        built = _at_image(rig, view, image, scan, outlines)
+        if built is None:
+            n_moving += 1
+            continue
+        outlined.append(built)
+        images.append(image)
+    subject = f"{camera} and {lidar}"
+    if not outlined:
+        return (SCENE_MOVING if n_moving else SCENE_NO_VIEWS)(subject, n_views=n_moving), []
+    estimate = estimate_scene(outlined, lens, T_nominal)
+    shortage = _shortage(subject, estimate, images)
+    if shortage is None:
+        change = find_better_focal(outlined, lens, estimate.T_cam_lidar)
+        if change is not None:
+            shortage = SCENE_LENS(subject, change=100 * change, n_views=len(outlined))
+    poses = {"nominal": T_nominal} | ({} if shortage else {"estimated": estimate.T_cam_lidar})
+    drawn = [Drawn(camera, lidar, *each, poses) for each in zip(images, outlined, strict=True)]
+    if shortage is not None:
+        return shortage, drawn
+    names = tuple(view.capture for view in outlined)
+    calibration = Calibration(
+        camera=camera,
+        channels=(channel or "",),
+        lidar=lidar,
+        T_cam_lidar=estimate.T_cam_lidar,
+        cov=estimate.cov,
+        n_captures=len(views),
+        n_detected=len(outlined),
+        captures_used=names,
+        captures_refused={},
+        metrics=Metrics(math.nan, math.nan, math.nan),
+        certificate=Certificate(False, math.inf),
+        verdict="marginal",
+        method=METHOD,
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, estimate.cov, lens),
+        intrinsics=lens,
+    )
+    return with_findings(calibration, list(_findings(rig, nominal, estimate, n_moving))), drawn
+
+
+def _at_image(rig: Rig, view: View, image: Image, scan: Scan, built: OutlineView) -> OutlineView | None:
+    """Move outlines to the image's time if the rig moves; None where times are unknown."""
+    previous = view.previous.get(scan.sensor)
+    motion = None if previous is None else estimate_motion(rig.corrected(previous), scan)
+    if motion is None or motion.is_still:
+        return built
+    scan_ns, image_ns = rig_time_ns(scan, rig), rig_time_ns(image, rig)
+    fired_s = firing_times_s(scan, built.outlines.points)
+    if scan_ns is None or image_ns is None or fired_s is None:
+        return None
+    points = motion.moved(built.outlines.points, 1e-9 * (image_ns - scan_ns) - fired_s)
+    return replace(built, outlines=replace(built.outlines, points=points))
+
+
+def _shortage(subject: str, estimate: SceneEstimate, images: Sequence[Image]) -> Finding | None:
+    """Name why the scene cannot tell; None if it can."""
+    brightest = max(float(np.percentile(image.grey, 99)) for image in images)
+    figures: dict[str, Any] = {"n_views": len(images), "n_edges": estimate.n_edges}
+    if estimate.state != "usable" and brightest < _DARK:
+        return SCENE_DARK(subject, grey_99=brightest, limit=_DARK, **figures)
+    if estimate.state == "few_edges":
+        return SCENE_FEW_EDGES(subject, **figures)
+    if estimate.state == "weak":
+        return SCENE_WEAK(subject, score=estimate.score, min_score=MIN_SCORE, **figures)
+    if estimate.state == "ambiguous":
+        return SCENE_AMBIGUOUS(subject, gain=estimate.gain, **figures)
+    if estimate.state == "beyond_reach":
+        reach_m, reach_deg = float(estimate.reach[0]), math.degrees(estimate.reach[3])
+        return SCENE_BEYOND_REACH(subject, reach_deg=reach_deg, reach_m=reach_m)
+    if estimate.undetermined:
+        axes = tuple(dict.fromkeys(axis for axes in estimate.undetermined for axis in axes))
+        return SCENE_UNDETERMINED(subject, axes=axes, **figures)
+    return None
+
+
+def _findings(
+    rig: Rig, nominal: NominalExtrinsic, estimate: SceneEstimate, n_moving: int
+) -> Iterator[Finding]:
+    """List what keeps extrinsics from a pass."""
+    subject = f"{nominal.camera} and {nominal.lidar}"
+    target, sigmas = rig.calibration, np.sqrt(np.diag(estimate.cov))
+    sigma_deg, sigma_m = sigma_sizes(estimate.cov)
+    if target.in_targets(sigma_deg, sigma_m) > 1:
+        limits = np.r_[np.full(3, target.target_sigma_m), np.full(3, np.radians(target.target_sigma_deg))]
+        yield SCENE_UNCERTAIN(
+            subject,
+            sigma_deg=sigma_deg,
+            sigma_m=sigma_m,
+            target_deg=target.target_sigma_deg,
+            target_m=target.target_sigma_m,
+            weakest=MOTIONS[int(np.argmax(sigmas / limits))],
+        )
+    if nominal.source == "typical":
+        yield SCENE_TYPICAL(subject)
+    yield from nominal_findings(estimate.T_cam_lidar, nominal)
+    if n_moving:
+        yield SCENE_MOVING(subject, severity="note", n_views=n_moving)
