@@ -76,7 +76,7 @@ class _Darkroom:
         yield from self._develop()
 
     def finish(self) -> Iterator[Image]:
-        """Give what is left when the stream has ended."""
+        """Yield the remaining images after the end of the stream."""
         self._newest_ns = 2**62
         yield from self._develop()
 

@@ -158,7 +158,7 @@ def _sum(packets: tuple[Events, ...], start_ns: int, end_ns: int, size: tuple[in
 
 
 def _correlation(one: Array, other: Array) -> float:
-    """Correlate two maps (H, W) ; NaN where nothing moves."""
+    """Correlate two maps (H, W); NaN if nothing moves."""
     spread = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))
     if spread == 0 or np.count_nonzero(other) < _MOVING * other.size:
         return math.nan

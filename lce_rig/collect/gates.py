@@ -48,22 +48,22 @@ def stillness_window_s(rig: Rig) -> float:
 
 
 class StillnessGate:
-    """Takes detections in order of time, and gives the stillest moment of every stretch of stillness.
+    """Picks the stillest moment of every period of stillness from detections in order of time.
 
-    It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
-    the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+    It is the middle of the window with the least motion, of those below `max_motion_m`. A period ends when
+    the board moves, is lost, or has stood for `dwell_s`; its moment is then returned once.
 
     Args:
         board: the profile's.
-        max_motion_m: how far it may move in a window; a hand never holds it quite still.
-        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
-        takes_singles: whether a detection with none in two windows before and after it is a moment, as of a
-            recording that was triggered once for each placement; nothing tells whether its board stood still.
+        max_motion_m: largest motion of the board in a window; a hand never holds it quite still.
+        dwell_s: time after which a capture is taken without waiting for the board to be moved on.
+        takes_singles: whether a detection without others in two windows before and after it is a moment, as
+            in a recording triggered once per placement; its stillness cannot be checked.
         window_s: of stillness.
 
     Attributes:
-        motion_m: how far the board moved in the last window; infinite where there is no whole one.
-        held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
+        motion_m: motion of the board in the last window; infinite without a complete window.
+        held_s: duration of the present period since its first complete window; None outside a period.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class StillnessGate:
         self._since_ns = 0
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection, and give the moment of a stretch that has ended with it."""
+        """Take the next detection; return the moment of a period that ends with it."""
         now_ns = detection.frame.time_ns
         is_apart = self._last_ns is None or now_ns - self._last_ns > 2 * self._window_ns
         alone = self._take_single() if is_apart else []
@@ -108,7 +108,7 @@ class StillnessGate:
         return alone
 
     def finish(self) -> list[CaptureMoment]:
-        """Give the moment of the stretch that lasts, where there is one, and end it."""
+        """Return the moment of the present period, if any, and end the period."""
         return [*self._take_single(), *self._end_stretch()]
 
     def _take_single(self) -> list[CaptureMoment]:
@@ -170,7 +170,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
 
 
 def _square_px(corners_px: Array, board: Board) -> float:
-    """Measure the side of a square; where no two neighbours are visible, by how far corners are spread."""
+    """Return the median side of a square, px; from the spread of corners if no two neighbours are visible."""
     grid = corners_px.reshape(board.rows, board.cols, 2)
     sides = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     if np.isfinite(sides).any():
@@ -183,7 +183,7 @@ def _square_px(corners_px: Array, board: Board) -> float:
 
 
 def _rms(difference: Array) -> float:
-    """Measure the rms distance (N, 2) of corners that both images show; infinite where there are none."""
+    """Compute the rms of differences (N, 2) of the corners that both images show; infinite without any."""
     squares = np.sum(difference**2, axis=-1)
     squares = squares[np.isfinite(squares)]
     return float(np.sqrt(np.mean(squares))) if len(squares) else np.inf
@@ -192,9 +192,9 @@ def _rms(difference: Array) -> float:
 def _plane_motion_m(
     reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float, where: Array
 ) -> float:
-    """Measure by how much the plane of the nearest candidate passes by points (K, 3) of the reference.
+    """Return the largest distance of points (K, 3) of the reference from the nearest candidate's plane, m.
 
-    The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
+    The centre is accurate to a few centimetres only along the board, and serves to select the plate.
     """
     centre = reference.T_lidar_board[:3, 3]
     distances = [float(np.linalg.norm(c.T_lidar_board[:3, 3] - centre)) for c in candidates]
@@ -318,18 +318,18 @@ _UNSTEADY_M = 0.01
 
 
 class MotionGate:
-    """Takes detections in order of time, and gives the best moment of every place that the board passes.
+    """Picks the best moment of every placement that the board passes from detections in order of time.
 
     Args:
         rig: the profile.
-        taken: no placements yet; it says how far apart they must be.
-        tally: receives why other detections are no moments.
-        patience_s: for so long a moment waits for a better one of the same place.
+        taken: placements captured so far, and how far apart they must be; new ones are added.
+        tally: counts the refusals of all other detections.
+        patience_s: time for which a moment waits for a better one of the same placement.
         takes_frames: whether frames are captured where events are missing, too.
 
     Attributes:
-        judged: the last detection that could be judged: a moment that will do, or why it does not; None where
-            no camera of events saw the board.
+        judged: result for the last detection that could be judged: a usable moment, or its refusal; None if
+            no event camera saw the board.
     """
 
     def __init__(
@@ -351,7 +351,7 @@ class MotionGate:
         self._pending: deque[CaptureMoment] = deque()
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection, and give the moments that nothing better can follow."""
+        """Take the next detection; return the moments that are final."""
         near, now_ns, moments = self._near, detection.frame.time_ns, list[CaptureMoment]()
         if near and now_ns <= near[-1].frame.time_ns:
             # The clocks were set back.
@@ -365,7 +365,7 @@ class MotionGate:
         return moments
 
     def finish(self) -> list[CaptureMoment]:
-        """Give what is left when nothing more comes."""
+        """Return the remaining moments after the last detection."""
         moments = self._judge_until(np.inf)
         self._near.clear()
         while self._pending:
@@ -373,7 +373,7 @@ class MotionGate:
         return moments
 
     def _judge_until(self, end_ns: float) -> list[CaptureMoment]:
-        """Judge the detections that wait up to a time; give the moments that nothing better came after."""
+        """Judge the waiting detections up to a time; return the moments that are final."""
         moments: list[CaptureMoment] = []
         while self._n_waiting and self._near[-self._n_waiting].frame.time_ns <= end_ns:
             detection = self._near[-self._n_waiting]

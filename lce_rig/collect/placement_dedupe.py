@@ -19,7 +19,7 @@ MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
 
 
 def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: float) -> NDArray[np.bool_]:
-    """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+    """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
     way_m = np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
     # The pattern may be read from either end.
     R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
@@ -44,15 +44,15 @@ class Placements:
         self._poses[name] = poses
 
     def remove(self, name: str) -> None:
-        """Forget a capture: where it was made is new again."""
+        """Forget a capture, so that its placement counts as new."""
         self._poses.pop(name, None)
 
     def has_like(self, poses: Mapping[ImageKey, Array]) -> bool:
-        """Check whether every camera saw the board of one of the captures where it is now."""
+        """Check whether the poses, for every camera, are those of one of the captures."""
         return any(self.are_alike(held, poses) for held in self._poses.values())
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
-        """Check whether every camera that saw both boards saw them at one place; False where none did."""
+        """Check whether every camera that saw both boards saw them at one place; False if none did."""
         limits = self._min_move_m, self._min_turn_rad
         shared = one.keys() & two.keys()
         return bool(shared) and all(find_alike(one[key][None], two[key][None], *limits) for key in shared)

@@ -62,10 +62,10 @@ class Worker:
                 process.kill()
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call a method of the object, and give what it returns.
+        """Call a method of the object, and return its result.
 
         Raises:
-            LceRigError: as the method does; SourceError where its process ends again and again.
+            LceRigError: as the method does; SourceError if its process ends twice.
         """
         with self._lock:
             for _ in range(2):

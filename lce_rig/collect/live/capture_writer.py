@@ -1,4 +1,4 @@
-"""What becomes of a live capture: it is written, raw streams beside it on request, then learned from."""
+"""Write live captures, and raw streams on request, and let the guidance learn from the captures."""
 
 import time
 from collections import deque
@@ -69,7 +69,7 @@ class Learning:
                 self._due.append(k)
 
     def teach(self) -> None:
-        """Pass what was learned since the last call to its guide, and begin to learn what came since."""
+        """Pass the planner learned since the last call to its guide, and learn from newer captures."""
         if self._running is not None and self._running[1].done():
             k, learned = self._running
             self._running, planner = None, None
@@ -77,7 +77,7 @@ class Learning:
                 planner = learned.result()
             except Exception as error:  # Captures are safe even if a calibration fails.
                 self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
-            # Where captures came, or were taken back, meanwhile, it is due again.
+            # If captures were added or taken back meanwhile, this guide is due again.
             if k not in self._due:
                 self._guides[k].adopt(planner)
         if self._running is None and self._due and self._is_open:
@@ -94,7 +94,7 @@ class Learning:
                 guide.adopt(None)
 
     def notes(self) -> list[str]:
-        """Say what went wrong."""
+        """Return the problem of the last attempt to learn, if any."""
         return [self._problem] if self._problem else []
 
 
@@ -136,7 +136,7 @@ class CaptureWriter:
         self.disk: DiskWriter[Callable[[], None]] = DiskWriter(session.path, lambda step: step())
 
     def close(self) -> None:
-        """Write what was asked for.
+        """Write the pending captures, and stop.
 
         Raises:
             SessionError: a capture cannot be written.
@@ -181,10 +181,10 @@ class CaptureWriter:
     def take(self) -> list[tuple[str, BoardDetection | None, float]]:
         """Return the captures saved or taken back since the last call, by name.
 
-        Each comes with its detection, None where it was taken back, and the time in s until it was safe.
+        Each comes with its detection, None if it was taken back, and the time in s until it was safe.
 
         Raises:
-            SessionError: one cannot be written: the disk is full, or gone.
+            SessionError: a capture cannot be written: the disk is full, or gone.
         """
         failure = self.disk.failure
         done = [self._done.popleft() for _ in range(len(self._done))]
