@@ -43,12 +43,12 @@ Value = bool | int | float | str
 
 
 class OpenedCamera(NamedTuple):
-    """A camera that is ready to be read.
+    """A camera that is ready to read.
 
     Attributes:
-        input: dv-processing's object; its getNext* are asked.
+        input: dv-processing's object, read by its getNext* methods.
         device: its model, serial number and firmware.
-        notes: what it does otherwise than asked.
+        notes: settings that differ from those requested.
         serial: its serial number.
     """
 
@@ -91,7 +91,7 @@ class DavisSource(LiveSource):
         """Open and set up the camera.
 
         Raises:
-            SourceError: it is absent, busy, another model, or cannot do what the profile wants.
+            SourceError: it is absent, busy, another model, or does not support the profile's settings.
         """
         self._opened = self._open_camera(self.sensor, self._settings)
         self._input: Any = self._opened.input
@@ -132,7 +132,7 @@ class DavisSource(LiveSource):
         )
 
     def read(self) -> list[LiveSample]:
-        """Ask every stream once: between them there is no order of time."""
+        """Read every stream once; samples of different streams are not in time order."""
         host_ns = time.time_ns()
         samples: list[LiveSample] = []
         store = self._input.getNextEventBatch() if self._has["events"] else None

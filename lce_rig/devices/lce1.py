@@ -1,7 +1,7 @@
-"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and what its messages add up to.
+"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and the board's state from it.
 
-Bytes come in; pulses, clocks and problems come out: no device, no thread. Sentences are framed as NMEA 0183
-frames them: `$`, name and fields, `*`, and the exclusive or of what lies between.
+Bytes come in; pulses, clocks and problems come out, without a device or a thread. Sentences are framed as in
+NMEA 0183: `$`, name and fields, `*`, and the exclusive or of the bytes in between.
 """
 
 import math
@@ -117,7 +117,7 @@ def _number(field: bytes) -> int:
 
 
 def read_line(line: bytes) -> Message | None:
-    """Read one line, without its end; None where it is text or another sentence.
+    """Parse one line, without its end; None for text or another sentence.
 
     Raises:
         ValueError: the line is damaged.
@@ -158,9 +158,9 @@ class LineReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take bytes as they come, and give the messages that they complete."""
+        """Take received bytes, and return the messages that they complete."""
         *lines, rest = (self._rest + data).split(b"\n")
-        # Enough of a line without an end to tell that it is too long.
+        # This part of an unfinished line is enough to detect that it is too long.
         self._rest = rest[: MAX_LINE + 1]
         messages: list[Message] = []
         for line in lines:
@@ -199,15 +199,15 @@ class BoardState:
     Attributes:
         reader: reads the lines, and counts damaged ones.
         n_pulses: pulses handed on, by line.
-        n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
-        n_restarts: how often the board restarted.
-        restarted_ns: when it last did, by the steady clock; None where it did not.
-        heard_ns: when the last message came, or the port was opened, by the steady clock.
+        n_lost_by_line: pulses whose messages never came, by line, from gaps in the running numbers.
+        n_restarts: restarts of the board.
+        restarted_ns: time of the last restart, by the steady clock; None before one.
+        heard_ns: time of the last message, or of opening the port, by the steady clock.
         hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: of the last time request.
-        host_tracker, utc_tracker: of the computer's time of day and of UTC on the board's clock, by time
-            requests and by pulses per second; without a model before it is known.
+        host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from
+            time requests and pulses per second; without a model until there are enough of them.
     """
 
     def __init__(self, lines: Mapping[int, str]) -> None:
@@ -243,14 +243,14 @@ class BoardState:
         self._asked = (cookie, sent_ns)
 
     def feed(self, data: bytes, arrival: Arrival) -> list[Pulse]:
-        """Take bytes as they come, and give the pulses that they tell of."""
+        """Take received bytes, and return the pulses that they report."""
         messages = self.reader.feed(data)
         if messages:
             self.heard_ns = arrival.steady_ns
         return [pulse for message in messages for pulse in self.take(message, arrival)]
 
     def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
-        """Take a message, and give the pulses that it tells of."""
+        """Take a message, and return the pulses that it reports."""
         match message:
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
                 if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:

@@ -58,10 +58,10 @@ class VideoDevice:
             raise
 
     def ioctl(self, code: int, what: Structure | c_int32) -> None:
-        """Ask the kernel; the answer stands in `what`.
+        """Call the kernel, which writes its answer to the structure.
 
         Raises:
-            OSError: as the kernel says.
+            OSError: from the kernel.
         """
         ioctl(self._fd, code, what, True)
 
@@ -144,11 +144,11 @@ class VideoDevice:
         self.grants(abi.REQUEST_BUFFERS, request)
 
     def read(self, timeout_s: float) -> tuple[bytes, Any] | None:
-        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None where none came in time.
+        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None if none came in time.
 
         Raises:
             SourceError: the device is gone.
-            OSError: it failed this once (EIO).
+            OSError: this one image failed (EIO).
         """
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
@@ -258,13 +258,13 @@ def list_controls(device: VideoDevice) -> dict[str, Control]:
 
 
 def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]) -> list[Finding]:
-    """Set what the profile wants: choices first, since automatic modes lock other settings.
+    """Apply the profile's controls: choices first, since automatic modes lock other settings.
 
     Returns:
-        What the device set otherwise than asked: it keeps numbers within its range.
+        Deviations from the requested values: the device clips numbers to its range.
 
     Raises:
-        SourceError: it has no such setting, or cannot take the value.
+        SourceError: the device lacks the setting, or cannot take the value.
     """
     known = list_controls(device)
     where = f"camera {sensor!r}: driver.controls"
@@ -299,7 +299,7 @@ def read_control(device: VideoDevice, setting: Control) -> int | None:
 
 
 def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float | None:
-    """Read how long a row is exposed; None where no setting says so in a known unit.
+    """Read the exposure time of a row, us; None without a setting in a known unit.
 
     V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
     """
