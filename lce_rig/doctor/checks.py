@@ -1,8 +1,8 @@
-"""Is this computer, with these sensors, fit to collect? Every check, and the table of them.
+"""Checks of whether this computer, with these sensors, is ready to collect.
 
-A check yields findings, first how it is as a note, then what is wrong. A check of the computer takes the
-examination, all others the name of a sensor with it. A fault is a warning where collecting works, less well,
-and an error where it does not or its data are wrong.
+A check yields findings: first its notes, then the faults. A check of the computer takes the examination, all
+others also the name of a sensor. A fault is a warning if collecting works, but less well. It is an error if
+collecting fails or its data are wrong.
 """
 
 import ctypes
@@ -98,7 +98,7 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Compare a LiDAR's or camera's rates with the profile, and count what was lost."""
+    """Compare a LiDAR's or camera's rates with the profile, and count its losses."""
     seen, rig = exam.seen[sensor], exam.rig
     status = seen.status
     if status is None:
@@ -134,7 +134,7 @@ def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
-    """Return how many scans or images a second the profile wants; None where it does not say."""
+    """Return the profile's rate of scans or images, Hz; None if it states none."""
     if sensor in rig.lidars:
         return rig.lidars[sensor].rate_hz
     settings = rig.cameras[sensor].driver
@@ -227,7 +227,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
     pulses = [pulse for pulse in board.pulses if pulse.sensor == sensor]
     n_frames, n_pulses = len(seen.frames), len(pulses)
     if seen.frames and pulses:
-        # While both came; by their running numbers, so that lost ones count.
+        # Count over the common interval, by sequence number, so that losses are included.
         frames_ns = [image.host_ns or 0 for image in seen.frames]
         first_ns = max(frames_ns[0], pulses[0].host_ns)
         last_ns = min(frames_ns[-1], pulses[-1].host_ns)
@@ -237,7 +237,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
         yield findings.UNEQUAL()
     trigger, clock = sync.triggers[sensor], board.host_clock
     if clock is None or trigger.rate_hz * trigger.max_delay_s >= 1:
-        return  # `collect` begins with slow pulses then, to tell which is which.
+        return  # `collect` then starts with slow pulses, to match images to them.
     matcher, delays_ms = TriggerMatcher(sensor, round(1e9 * trigger.max_delay_s)), list[float]()
     matcher.set_clock(clock.inverse())
     samples: list[Pulse | Image] = sorted([*pulses, *seen.frames], key=lambda sample: sample.host_ns or 0)
@@ -342,11 +342,11 @@ CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = 
 
 @dataclass(frozen=True)
 class Check:
-    """One line: one thing looked at.
+    """Result of one check, a line of the report.
 
     Attributes:
-        subject: "computer", a sensor's name in the profile, or "rig" for what concerns several.
-        name: what was looked at, in a word.
+        subject: "computer", a sensor's name in the profile, or "rig" for several sensors together.
+        name: the item checked, in a word.
         findings: of the check; those without a subject get the line's.
     """
 
@@ -370,18 +370,18 @@ class Check:
 
 
 def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Check]:
-    """Look at the computer and every sensor of a rig.
+    """Examine the computer and every sensor of a rig.
 
-    What is absent or fails is an error; everything else is looked at all the same. Takes the duration, and
-    what the sensors take to open.
+    An absent or failing sensor is an error, and everything else is still examined. Takes the duration, and
+    the time that the sensors take to open.
 
     Args:
         rig: the profile.
-        duration_s: for how long the sensors are watched.
-        folder: where sessions are to be written.
+        duration_s: time for which the sensors are watched.
+        folder: of the sessions.
 
     Returns:
-        A line for each thing looked at: the computer's, each sensor's, the rig's.
+        A line for each check: of the computer, of each sensor, of the rig.
     """
     seen, sources = dict[str, ObservedSensor](), list[LiveSource]()
     for sensor in sensors(rig):

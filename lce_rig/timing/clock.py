@@ -25,14 +25,14 @@ class ClockModel:
     Attributes:
         anchor_ns: time on the source's clock, in the middle of the data.
         reference_ns: time on the reference's clock at that moment.
-        drift: by how much faster the reference runs, as a fraction: 40e-6 is 40 ppm.
+        drift: excess of the reference's rate over the source's, as a fraction: 40e-6 is 40 ppm.
         cov: (2, 2) of the reference's time at the anchor in ns, and of `drift` in ns per ns.
         bias_sigma_ns: error common to all readings (an answer that is always slower than its request); it
             leaves no trace in their scatter.
         rms_ns: scatter of the readings about the line.
-        first_ns, last_ns: from when to when on the source's clock there were readings.
+        first_ns, last_ns: range of the readings on the source's clock.
         n_used: readings the line was fitted to, without outliers.
-        origin: what the readings were, in words: "98 time requests".
+        origin: the readings in words: "98 time requests".
     """
 
     anchor_ns: int

@@ -1,8 +1,9 @@
-"""Every sensor's timestamps on one clock, tied while collecting goes on.
+"""All sensors' timestamps on one clock, synchronised during collection.
 
-With a sync board that is UTC as the board has it: the LiDAR's own where it is locked to the board's pulses,
-images by the pulses that made them, an event camera by the edges it saw, all else by the computer's clock
-and the board's answers. Without one everything stays on the computer's clock.
+With a sync board this clock is UTC as the board has it. A LiDAR locked to the board's pulses is on it
+already. Images are timed by the pulses that triggered them, and an event camera by the edges that it saw. All
+others are converted by the computer's clock and the board's answers. Without a board, all timestamps stay on
+the computer's clock.
 """
 
 from collections import deque
@@ -37,7 +38,7 @@ BOARD_SPEED_MPS = 1.0
 
 
 class SyncVerdict(NamedTuple):
-    """Whether boards must stand still while they are captured; `reasons` are empty where they may move."""
+    """Whether boards must stand still while they are captured; `reasons` is empty if they may move."""
 
     reasons: tuple[Finding, ...]
 
@@ -53,13 +54,13 @@ class SyncVerdict(NamedTuple):
 
 
 class EdgeClock:
-    """Pulses of the board and edges that a sensor saw, and the board's time on that sensor's clock.
+    """The board's time on a sensor's clock, fitted to the board's pulses and the edges that the sensor saw.
 
-    A DAVIS346 stamps the edges at its trigger input and does not number them. Which edge is which pulse
-    follows from a coarse model of its clock; once a fit is made, the fit itself decides.
+    A DAVIS346 timestamps the edges at its trigger input without numbers. Edges are matched to pulses by a
+    coarse model of its clock and, once a fit exists, by the fit.
 
     Attributes:
-        problem: why there is no model; None while there is one.
+        problem: why a model is not available; None with one.
     """
 
     def __init__(self, sensor: str, coarse_error_ns: float) -> None:
@@ -67,7 +68,7 @@ class EdgeClock:
 
         Args:
             sensor: its name in the profile.
-            coarse_error_ns: how far off the coarse model may be.
+            coarse_error_ns: largest error of the coarse model.
         """
         self.problem: Finding | None = findings.NO_EDGES(sensor)
         self._sensor = sensor
@@ -100,12 +101,12 @@ class EdgeClock:
         self._model = None
 
     def fit(self) -> ClockModel | None:
-        """Fit the board's time on the sensor's clock to the last minute's edges; None where it cannot be."""
+        """Fit the board's time on the sensor's clock to the last minute's edges; None if that fails."""
         start = self._model or self._coarse
         if start is None or len(self._sent_ns) < MIN_PAIRS or not self._seen_ns:
             return None
         sent_ns = _recent(self._sent_ns)
-        # Edges whose pulses are known; others say nothing.
+        # Only edges in the time range of known pulses.
         back, seen_ns = start.inverse(), _recent(self._seen_ns)
         first_ns = back.convert(int(sent_ns[0])) - self._coarse_error_ns
         last_ns = back.convert(int(sent_ns[-1])) + self._coarse_error_ns
@@ -131,19 +132,19 @@ def _recent(times_ns: deque[int]) -> Stamps:
 
 
 class RigClock:
-    """Puts samples onto the rig's clock: the same while collecting and for `doctor`.
+    """Puts samples onto the rig's clock, for `collect` and `doctor` alike.
 
     Attributes:
-        models: by the sensor's name, from its clock to the rig's; what was placed before keeps its time.
+        models: by the sensor's name, from its clock to the rig's; samples placed earlier keep their time.
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:
-        """Begin with nothing tied.
+        """Begin without models.
 
         Args:
-            rig: says which sensors there are, and which of the board's lines triggers which.
-            has_board: whether a sync board is there.
-            edge_cameras: cameras that stamp the board's edges themselves.
+            rig: the profile, with the sensors and their trigger lines.
+            has_board: whether a sync board is attached.
+            edge_cameras: cameras that timestamp the board's edges themselves.
         """
         self.models: dict[str, ClockModel] = {}
         self._rig = rig
@@ -167,7 +168,7 @@ class RigClock:
 
     @property
     def needs_slow_triggers(self) -> bool:
-        """Whether pulses at the profile's rates are too quick to tell yet which made which image."""
+        """Whether pulses at the profile's rates are still too fast to match images to them."""
         return any(matcher.problem is not None for matcher in self._quick)
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
@@ -184,7 +185,7 @@ class RigClock:
         return [self.place(sample)]
 
     def place(self, sample: Sample) -> Sample:
-        """Return a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
+        """Return a sample with timestamps on the rig's clock; unchanged without a model of its sensor."""
         model = self.models.get(sample.sensor)
         if model is None:
             return sample
@@ -202,7 +203,7 @@ class RigClock:
             locked: LiDARs whose timestamps are UTC by the board's pulses.
         """
         self._host, self._utc = host_clock, utc_clock
-        # For timestamps of the computer's time; None where it is the rig's clock itself.
+        # For timestamps of the computer's time; None if that is the rig's clock itself.
         host = host_clock.inverse().then(utc_clock) if host_clock and utc_clock else None
         for name in self._rig.lidars:
             own = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
@@ -285,7 +286,7 @@ class RigClock:
         return [self._at_pulse(each.image, each.stamp_ns) for each in matched] if was_matching else []
 
     def _at_pulse(self, image: Image, board_ns: int) -> Image:
-        """Stamp an image by the pulse that made it; as it is while no clock is known."""
+        """Timestamp an image by the pulse that triggered it; unchanged while no clock is known."""
         clock = self._utc or self._host
         if clock is None:  # A clock that jumped has no model until a few answers have come.
             return image

@@ -1,10 +1,10 @@
 """Triggered images and the pulses that made them, matched by their running numbers.
 
-A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, which a few
-images at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
-nor a lost line can mix them up. The camera's timestamps still check the constant: a pulse that the camera
-missed, or a frame that its driver did not number, shifts every later image by whole pulses, and the constant
-is sought again.
+A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, found from the
+times of a few images at the start. From then on images are matched by number only, so that a busy computer or
+a lost line cannot mix them up. The camera's timestamps still check the constant: a pulse that the camera
+missed, or a frame that its driver did not number, shifts every later image by whole pulses. The constant is
+then determined again.
 """
 
 from collections import Counter, deque
@@ -176,7 +176,7 @@ class TriggerMatcher:
             yield self._matched(frame, number)
             self._delays_ns.append(delay_ns)
             return
-        # One timestamp may be late; several in a row tell that the counts have slipped.
+        # One timestamp may be late; several in a row show that the counts have slipped.
         self.counts["n_unmatched"] += 1
         self._n_odd += 1
         if self._n_odd == N_AGREE:
@@ -188,7 +188,7 @@ class TriggerMatcher:
         return TriggeredImage(frame.image, number, pulse_ns, pulse_ns + round(median(self._delays_ns)))
 
     def _period_ns(self) -> float:
-        """Return the shortest time between two of the last few pulses; infinite where there is but one."""
+        """Return the shortest time between two of the last few pulses; infinite for a single pulse."""
         recent = islice(reversed(self._pulses.values()), _N_RECENT)
         return min((after - before for after, before in pairwise(recent)), default=float("inf"))
 
