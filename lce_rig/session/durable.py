@@ -95,7 +95,7 @@ def store_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> bool:
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Read what `store_arrays` wrote; None if there is no entry or it is damaged, by its checksums."""
+    """Read the arrays of `store_arrays`; None if the entry is missing or damaged, by its checksums."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

@@ -93,7 +93,7 @@ class Session:
             lock = WriterLock(path / LOCK)
             (path / CAPTURES).mkdir(exist_ok=True)
             replace_file(path / PROFILE, dump_rig(rig).encode())
-            # Last, because its presence is what makes the folder a session.
+            # Last, because a folder with this file is a session.
             replace_file(path / MARKER, marker_of(rig))
         session = cls(path, rig, lock)
         session.journal("created", rig=rig.name, made_by=f"lce-rig {__version__}")
@@ -101,7 +101,7 @@ class Session:
 
     @classmethod
     def open(cls, path: Path | str, *, writable: bool = False) -> "Session":
-        """Open an existing session; for writing it also clears what a killed writer left behind.
+        """Open an existing session; opening for writing also clears the remains of a killed writer.
 
         Raises:
             SessionError: it is not a session, damaged, made by a newer version, or another process writes to
@@ -135,7 +135,7 @@ class Session:
     def resume(cls, path: Path | str, rig: Rig) -> "Session":
         """Continue the session of this rig in a folder, or start one there.
 
-        A session without captures takes the profile, whatever it differs in.
+        A session without captures takes the profile, even with differences.
 
         Raises:
             SessionError: as `create` and `open`, or the session belongs to another rig.
@@ -150,7 +150,7 @@ class Session:
             session.close()
             hint = "Collect into another folder, or use the profile in the session (its rig.yaml)."
             raise _of_another_rig(session, rig, differing, hint)
-        # What may differ: addresses of attached sensors, the robot, serial numbers.
+        # Allowed differences: addresses of attached sensors, the robot, serial numbers.
         adopted = rig if is_replaced else keep_identity(session.rig, rig)
         if adopted != session.rig:
             try:
@@ -163,15 +163,15 @@ class Session:
         return session
 
     def adopt(self, rig: Rig) -> str:
-        """Take another profile of the same rig as the session's; the earlier one stays beside it.
+        """Replace the session's profile by another of the same rig; the earlier one stays beside it.
 
-        Detections are found again where they depend on what changed, as their keys in the cache do.
+        Detections whose keys in the cache depend on the changes are computed again.
 
         Args:
             rig: with the session's name and sensors; board, intrinsics, limits and the like may differ.
 
         Returns:
-            The file that holds the earlier profile, such as "rig-1.yaml"; "" where both are the same.
+            The file of the earlier profile, such as "rig-1.yaml"; "" if both are the same.
 
         Raises:
             SessionError: the profile is of another rig, the session is open read-only, or the disk is full.
@@ -206,7 +206,7 @@ class Session:
 
     @property
     def other_profile(self) -> str | None:
-        """The text of the profile of `with_profile`; None where it is the session's own."""
+        """Text of the profile of `with_profile`; None if the session uses its own."""
         return self._other_profile
 
     def profile_content(self) -> bytes:
@@ -226,7 +226,7 @@ class Session:
         return keep_identity(self.rig, rig)
 
     def keep_text(self, text: str) -> None:
-        """Keep a profile's text with its comments, if it says what the session's profile says.
+        """Keep a profile's text with its comments, if it is equivalent to the session's profile.
 
         Raises:
             SessionError: the disk is full or read-only.
@@ -245,7 +245,7 @@ class Session:
         return read_profile(find_profile(name)) if is_shipped else dump_rig(self.rig)
 
     def _says(self, text: str) -> bool:
-        """Tell whether a profile's text is that of this session, but for the robot and serial numbers."""
+        """Check whether a profile's text equals this session's, apart from the robot and serial numbers."""
         with suppress(LceRigError, KeyError):  # KeyError: it has other sensors
             return keep_identity(self.rig, parse_rig(text)) == self.rig
         return False
@@ -305,14 +305,14 @@ class Session:
         return self.rig.corrected(capture.scan(lidar))
 
     def reject(self, name: str, reason: str = "") -> None:
-        """Put a capture aside: it is used no more, and not collected again.
+        """Put a capture aside: it is no longer used, and not collected again.
 
         Args:
             name: of the capture.
             reason: kept in the journal.
 
         Raises:
-            SessionError: there is no capture of that name, the session is open read-only, or the disk is.
+            SessionError: the capture does not exist, or the session or its disk is read-only.
         """
         self.capture(name)
         self._move(name, CAPTURES, REJECTED, "rejected", reason=reason)
