@@ -101,7 +101,7 @@ class EventColumns:
     Attributes:
         t_ns: (N,) int64 device time.
         x, y: (N,) uint16 px.
-        polarity: (N,) bool, True where it became brighter.
+        polarity: (N,) bool, True for brighter.
         host_ns: arrival of the first event at the host; None where unknown.
     """
 
@@ -128,7 +128,7 @@ class Events:
         t_ns: (N,) int64 device time, never decreasing; microsecond timestamps times 1000, kept exactly.
         x: (N,) uint16 column.
         y: (N,) uint16 row.
-        polarity: (N,) bool, True where it became brighter.
+        polarity: (N,) bool, True for brighter.
         width_px, height_px: resolution of the sensor.
         host_ns: arrival of the first event at the host; None if unknown.
     """
@@ -192,7 +192,7 @@ class Pulse:
 
 @dataclass(frozen=True, order=True)
 class Stream:
-    """What one sensor sends.
+    """One stream of a sensor.
 
     Attributes:
         sensor: the camera or LiDAR.

@@ -1,4 +1,4 @@
-"""The print on a board: which points are dark, and where its markers are."""
+"""The pattern of a board: its dark points, and the places of its markers."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -48,7 +48,7 @@ def markers_of(board: Board, *, is_legacy: bool = False) -> Markers:
     Args:
         board: one that has markers.
         is_legacy: with the markers of a ChArUco board where OpenCV before 4.6 drew them: its upper left
-            square is white where it has an even number of rows.
+            square is white if it has an even number of rows.
     """
     s, (x0, y0) = board.square_m, board.pattern_offset_m
     if board.type == "charuco":

@@ -234,7 +234,7 @@ class BoardState:
         self._asked: tuple[int, int] | None = None
 
     def opened(self, steady_ns: int) -> None:
-        """Note that the port was opened: a board that was unplugged knows nothing any more."""
+        """Note that the port was opened: an unplugged board has lost its state."""
         self.hello = None
         self._opened_ns = self.heard_ns = steady_ns
 

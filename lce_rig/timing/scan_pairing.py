@@ -78,8 +78,8 @@ class EventCut:
 
     @cached_property
     def events(self) -> Events:
-        """Every event with start_ns <= t < end_ns; joined only when wanted, as most frames show no board."""
-        # Arrival is known of a packet's first event, not of a stretch's.
+        """Every event with start_ns <= t < end_ns; joined on first use, as most frames show no board."""
+        # The arrival time is known for a packet's first event only.
         return replace(join_events(self.packets).between(self.start_ns, self.end_ns), host_ns=None)
 
     @property
@@ -257,7 +257,7 @@ class _Pairing:
         self._events.forget_before(self._position_ns - self._kept_ns)
 
     def due_frames(self) -> Iterator[Frame]:
-        """Yield the frames that nothing more can come for."""
+        """Yield the frames that no further sample can change."""
         while self._waiting:
             time_ns, half_ns, _ = self._waiting[0]
             have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
