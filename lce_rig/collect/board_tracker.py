@@ -141,7 +141,7 @@ class BoardTracker:
             self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
-        # Nothing is gained from scans while no camera sees the board.
+        # Scans are not needed while no camera sees the board.
         are_scans_enough = not self.rig.cameras
         for scan in detection.frame.scans if detection.images or are_scans_enough else ():
             candidates = self._find_in_scan(scan, detection.frame.time_ns)

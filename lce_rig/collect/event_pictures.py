@@ -81,7 +81,7 @@ class _Darkroom:
         yield from self._develop()
 
     def _develop(self) -> Iterator[Image]:
-        # Scans come late in bags: events wait for them before the network goes on.
+        # Scans come late in bags: events wait for them before the network uses them.
         while self._wanted:
             stamp_ns = self._wanted[0] - self._offset_ns
             has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] >= stamp_ns
@@ -103,7 +103,7 @@ class _Darkroom:
             self._feed(min([self._newest_ns - PATIENCE_NS, *self._wanted]) - self._offset_ns)
 
     def _feed(self, until_ns: int) -> None:
-        """Give the network all events before a timestamp of their clock."""
+        """Feed the network all events before a timestamp of their clock."""
         while self._packets and self._packets[0].t_ns[0] < until_ns:
             packet = self._packets.popleft()
             rest = packet.between(until_ns, int(packet.t_ns[-1]) + 1)

@@ -37,12 +37,12 @@ from lce_rig.detect.findings import IMAGE_FLICKER
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
-# For how long a board has to stand still at least, and for how many scans.
+# Least time for which a board must stand still, in seconds and in scans.
 _WINDOW_S, _WINDOW_SCANS = 0.5, 2.5
 
 
 def stillness_window_s(rig: Rig) -> float:
-    """Return for how long a board has to stand still: LiDARs without rings accumulate scans meanwhile."""
+    """Return how long a board must stand still: LiDARs without rings accumulate scans in this time."""
     slowest_hz = min((lidar.rate_hz for lidar in rig.lidars.values() if not lidar.has_rings), default=np.inf)
     return max(_WINDOW_S, _WINDOW_SCANS / slowest_hz)
 
@@ -205,13 +205,13 @@ def _plane_motion_m(
 
 
 SPEED_WINDOW_S = 0.5
-# Neither too few events nor smear.
+# Best speed of the board: slower ones give few events, faster ones smear.
 BEST_SPEED_MPS = 0.1
 
 _LEAST_DETECTIONS = 3
-# Slower boards make no events, unless there are as many a pixel in a second as this.
+# Least events per pixel and second of a board slower than `MIN_SPEED_MPS`.
 _PLENTY_EVENTS_PX = 4.0
-# Time without any event of a camera before which the board moves, ns: its stream has ended.
+# Time without events, ns, after which the stream of a camera counts as ended if the board moves.
 _SILENT_NS = 100_000_000
 
 
@@ -227,7 +227,7 @@ def judge_detection(
         takes_frames: whether frames are a moment without events, too.
 
     Returns:
-        The moment; why it is none; or None where the tracker has counted why.
+        The moment, or its refusal; None if the tracker has counted the refusal.
     """
     cuts = {cut.sensor: cut for cut in detection.frame.events}
     if detection.images and not cuts:
@@ -298,9 +298,9 @@ def _judge_camera(
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
-    """Fit a straight and steady way to the plate's middle: speed in m/s, and the rms distance from it in m.
+    """Fit a straight path at constant speed to the plate's middle: speed, m/s, and rms distance from it, m.
 
-    The middle is well known even where the tilt is not. None where the board was seen too seldom.
+    The middle is accurate even if the tilt is not. None if the board was detected too rarely.
     """
     seen = [s for s in around if key in s.images]
     if len(seen) < _LEAST_DETECTIONS:
@@ -313,7 +313,7 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-# A way that strays from a straight one by this counts as much as a speed e times too high or low.
+# Deviation from a straight path that counts as much as a speed e times too high or low.
 _UNSTEADY_M = 0.01
 
 
@@ -392,7 +392,7 @@ class MotionGate:
         return moments
 
     def _decide_oldest(self) -> list[CaptureMoment]:
-        """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
+        """Return the oldest moment if it is the best of its place, else drop it."""
         oldest = self._pending.popleft()
         if self._taken.has_like(oldest.detection.poses):
             return []

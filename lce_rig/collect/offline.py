@@ -35,9 +35,9 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 
-# How often an image without a board is searched thoroughly, which takes most of a second.
+# Interval of thorough searches of an image without a board, which take most of a second each.
 _THOROUGH_S = 1.0
-# A process of its own for images takes a second to start.
+# Least samples for which a separate process for images is worth its start of a second.
 _LONG_SAMPLES = 200
 
 

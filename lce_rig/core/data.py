@@ -72,7 +72,7 @@ class Scan:
     def corrected(self, range_offset_m: float) -> "Scan":
         """Subtract a constant from all ranges of a scan as recorded, along each ray from the origin.
 
-        A scan corrected by the same offset is returned unchanged, so that nothing is subtracted twice.
+        A scan corrected by the same offset is returned unchanged, so that it is not subtracted twice.
         Returns not beyond the offset are dropped.
 
         Args:
@@ -160,7 +160,7 @@ _Stretch = TypeVar("_Stretch", Events, EventColumns)
 
 
 def join_events(parts: Sequence[_Stretch]) -> _Stretch:
-    """Put stretches of one camera's stream together, at least one, in order of time."""
+    """Join ranges of one camera's stream, at least one, in order of time."""
     filled = [part for part in parts if len(part)] or parts[:1]
     if len(filled) == 1:
         return filled[0]

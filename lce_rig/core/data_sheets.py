@@ -87,7 +87,7 @@ class DataSheet:
 
     @property
     def n_rings(self) -> int:
-        """How many lasers it has."""
+        """Number of lasers."""
         return len(self.elevations_deg)
 
     @property
@@ -102,7 +102,7 @@ class DataSheet:
         return np.asarray(np.radians(np.sort(self.elevations_deg)))
 
     def step_rad(self, rate_hz: float) -> float:
-        """Give the turn of the rotor between two firings of one laser."""
+        """Return the rotor's turn between two firings of one laser."""
         if not self.has_rings:
             return float(np.radians(_LINE_DEG))
         if self.sequence_ns is None:

@@ -161,13 +161,13 @@ def tangent_sizes(tangent: Array) -> tuple[float, float]:
 
 
 def sigma_sizes(cov: Array) -> tuple[float, float]:
-    """Take the roots of the summed variances, rotation in deg and translation in m, of a tangent.
+    """Return the roots of the summed variances, rotation in deg and translation in m, of a tangent.
 
     Args:
         cov: (6 + k, 6 + k), the tangent first.
     """
     rotation, translation = np.trace(cov[3:6, 3:6]), np.trace(cov[:3, :3])
-    # Rounding may leave variances of nothing below zero.
+    # Rounding may leave zero variances slightly negative.
     rotation, translation = max(rotation, 0.0), max(translation, 0.0)
     return float(np.degrees(np.sqrt(rotation))), float(np.sqrt(translation))
 

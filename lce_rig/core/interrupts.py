@@ -102,7 +102,7 @@ def interrupt_no_more() -> None:
 
 @contextmanager
 def patience(grace_s: float) -> Iterator[None]:
-    """Return the program longer to end in good order, while the block lasts."""
+    """Extend the grace period of a clean shutdown while the block lasts."""
     if _watch is None:
         yield
         return

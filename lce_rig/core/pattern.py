@@ -15,7 +15,7 @@ DICTIONARIES = (
 )
 """OpenCV's dictionaries of markers, without DICT_."""
 LEAST_CORNERS = 8
-"""So many corners of a board with markers are needed in an image; fewer make a poor pose."""
+"""Least number of corners in an image of a board with markers; fewer make a poor pose."""
 # Kalibr's tags have a black border of two modules, other markers of one.
 _BORDER = {"charuco": 1, "aprilgrid": 2}
 # Tag 0 of AprilTag's family 36h11 as its authors draw it, from the upper left row by row. OpenCV's releases

@@ -25,7 +25,7 @@ from lce_rig.devices.reading import LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
-# A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
+# Capacity of the queue: batches of 10 ms from three streams for several seconds.
 _N_SLOTS = 2048
 _PAUSE_S, _SILENCE_S = 0.002, 5.0
 _MAX_CLOCK_ERROR_MS = 500.0
@@ -116,7 +116,7 @@ class DavisSource(LiveSource):
         """Report the state of the camera."""
         problems, clock = list(self._opened.notes), None
         if self._delays_ns:
-            # How old the freshest of the last events were on arrival.
+            # Least age of the latest events on arrival.
             delay_ms = min(self._delays_ns.copy()) * 1e-6
             clock = findings.DAVIS_CLOCK(delay_ms=delay_ms)
             if abs(delay_ms) > _MAX_CLOCK_ERROR_MS:

@@ -72,7 +72,7 @@ class DiskWriter(Generic[T]):
         self._thread.shutdown()
 
     def put(self, item: T, n_bytes: int = 0) -> None:
-        """Have an item written; never blocks. Where too much waits it is dropped."""
+        """Queue an item for writing; never blocks. Above the limit of waiting data it is dropped."""
         with self._lock:
             if self.failure is not None or self._is_closed:
                 return
@@ -104,7 +104,7 @@ class DiskWriter(Generic[T]):
             act()
         except LceRigError as error:
             self.failure = self.failure or error
-        except Exception as error:  # Nothing that goes wrong may end the thread.
+        except Exception as error:  # No error may end the thread.
             cause = getattr(error, "strerror", None) or repr(error)
             what, hint = f"{self.path} cannot be written: {cause}", "Free space there, or use another disk."
             self.failure = self.failure or SessionError(what, hint)

@@ -69,7 +69,7 @@ class TimeReply(NamedTuple):
 
 
 class BoardStatus(NamedTuple):
-    """How the board does, once a second: bits, and how many lines the host did not read so far."""
+    """State of the board, once per second: flags, and the number of lines that the host has not read."""
 
     flags: int
     n_lost: int
@@ -175,9 +175,9 @@ class LineReader:
         return messages
 
 
-# An answer that takes longer came while the computer's clock was set.
+# Longest round trip: a longer one means that the computer's clock was set meanwhile.
 _MAX_ROUND_TRIP_NS = 2 * NS_PER_S
-# Messages are out of order by less; a board whose time goes back further has restarted.
+# Largest step back of the board's time between messages out of order; a larger one is a restart.
 _MOST_BACK_NS = NS_PER_S
 _STALLED_S = 3.0
 _DAMAGED = 0.01
@@ -211,7 +211,7 @@ class BoardState:
     """
 
     def __init__(self, lines: Mapping[int, str]) -> None:
-        """Begin with a board that has said nothing yet.
+        """Begin with a board that has not sent a message yet.
 
         Args:
             lines: name of the camera on each channel; pulses on others are skipped.

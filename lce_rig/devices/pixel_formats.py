@@ -61,7 +61,7 @@ FORMATS = {
     "MJPG": PixelFormat(0),
     "JPEG": PixelFormat(0),
 }
-"""By four-character code, padded with blanks as the kernel does."""
+"""Formats by four-character code, padded with blanks as in the kernel."""
 
 
 def find_format(name: str) -> str | None:

@@ -97,7 +97,7 @@ class Inbox(Generic[T]):
             self._changed.notify()
 
     def close(self) -> None:
-        """End the queue: items in it can still be taken, and nothing is waited for."""
+        """End the queue: its items can still be taken, without waiting for more."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -114,7 +114,7 @@ class Inbox(Generic[T]):
 
 
 class RateMeter:
-    """How many a second came over the last seconds; may be asked from any thread.
+    """Rate of arrivals over the last seconds; may be read from any thread.
 
     Args:
         now_s: the clock.
@@ -126,7 +126,7 @@ class RateMeter:
         self._lock = threading.Lock()
 
     def add(self, n: int) -> None:
-        """Count n that have just come."""
+        """Count n arrivals now."""
         with self._lock:
             self._came.append((self._now_s(), n))
 
@@ -297,8 +297,8 @@ class LiveSource(ABC):
 class AttachedSensors:
     """The attached sensors of a rig, read side by side into one queue; open while its `with` block lasts.
 
-    They are opened at the same time. A sensor that fails is closed and opened again and again; meanwhile the
-    others go on.
+    They are opened at the same time. A sensor that fails is closed and reopened repeatedly; meanwhile the
+    others continue.
 
     Attributes:
         sources: by the sensor's name.

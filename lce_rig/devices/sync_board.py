@@ -102,7 +102,7 @@ class SyncBoard(LiveSource):
             )
 
     def close(self) -> None:
-        """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
+        """Close the port; the board's pulses continue, so that the LiDAR stays locked."""
         if self._port is not None:
             with suppress(serial.SerialException, OSError):
                 self._port.close()
@@ -211,7 +211,7 @@ class SyncBoard(LiveSource):
         return SourceError(f"{what} cannot be opened: {error}", "Check sync.device in the profile.")
 
     def _set_lines(self) -> None:
-        """Queue the commands that set the lines, for a board that knows nothing yet."""
+        """Queue the commands that set the lines of a board that has just started."""
         for trigger in self._settings.triggers.values():
             rate_hz = self._rate_hz or trigger.rate_hz
             line = f"{trigger.channel},{rate_hz:.6f},{trigger.phase_us},{trigger.pulse_us}"

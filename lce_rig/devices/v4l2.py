@@ -32,7 +32,7 @@ from lce_rig.devices.video_device import (
 )
 from lce_rig.rig import CameraSettings, DriverSettings, FrameTimingSettings
 
-# Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
+# Number of buffers: two drop images if the computer stalls for one, eight last for a quarter of a second.
 N_BUFFERS = 8
 _WAIT_S = 0.25
 _EXPOSURE_EVERY_S = 1.0

@@ -135,8 +135,8 @@ class VideoDevice:
             raise self._explain(error, "does not start") from None
 
     def stop(self) -> None:
-        """Stop and give the buffers back; never raises."""
-        # A device that was pulled out answers nothing any more.
+        """Stop and release the buffers; never raises."""
+        # An unplugged device does not answer.
         self.grants(abi.STREAM_OFF, c_int32(abi.VIDEO_CAPTURE))
         while self._buffers:
             self._buffers.pop().close()

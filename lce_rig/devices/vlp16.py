@@ -23,7 +23,7 @@ from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
-# A computer that is busy elsewhere for longer than this is too slow anyhow.
+# Least duration of packets that the buffer must hold: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
@@ -34,7 +34,7 @@ _GATHER_S = 0.005
 _WANTED_BUFFER_BYTES = 4 << 20
 # Buffer space per data packet: its bytes, and the kernel's overhead.
 _PACKET_COST_BYTES = 2304
-# Datagrams that are taken before other threads may run: 85 ms of data packets.
+# Datagrams read before other threads may run: 85 ms of data packets.
 _MOST_AT_ONCE = 64
 # asm-generic/socket.h; Python names neither.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40

@@ -43,7 +43,7 @@ _MAX_LOST_SHARE = 0.01
 _STOPPED_S = 1.0
 _US_PER_S = 1e6
 _SIGMA_PER_MAD = 1.4826
-# Frames and lines come in bursts: how many are still on their way differs.
+# Tolerance on the counts of frames and pulses, absolute and relative: both arrive in bursts.
 _ROOM, _MAX_UNLIKE = 2, 0.01
 
 
@@ -337,7 +337,7 @@ CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = 
     },
     "rig": {"sync": check_sync},
 }
-"""Every check by its line's name; a line without findings is left out."""
+"""Every check by its line's name; a line without findings is skipped."""
 
 
 @dataclass(frozen=True)

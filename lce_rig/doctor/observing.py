@@ -16,7 +16,7 @@ from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
-# A sync board that its port's opening resets takes some seconds to speak.
+# Longest time for sensors to open: a sync board that is reset by it takes some seconds to answer.
 _OPENING_S = 10.0
 _CLOSING_S = 3.0
 _POLL_S = 0.05

@@ -23,7 +23,7 @@ _LEAST_ALIGNED = 10
 
 
 class LensDifference(NamedTuple):
-    """How far apart a second lens model projects the rays of a first one's pixels where boards were seen.
+    """Distance between the pixels of two lens models for the same rays, at places with boards.
 
     Attributes:
         rms_px: rms distance; infinite if the first model projects none of the pixels.

@@ -147,12 +147,12 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     return vector
 
 
-# Where a profile states no standard deviation of its intrinsics, in focal lengths; the last is of a pixel in
-# the image's corner. Chosen on some rigs' recordings, they repeat best on the other rigs', too.
+# Default standard deviations of a profile's intrinsics, in focal lengths; the last is of a pixel in the
+# image's corner. Chosen for the best repeatability on some rigs' recordings, they are best on others, too.
 _FOCAL, _PRINCIPAL_POINT, _DISTORTION = 2.5e-3, 4e-3, 2.5e-3
-# Of the ratio of both focal lengths.
+# Standard deviation of the ratio of both focal lengths.
 _ASPECT = 5e-4
-# The mean square over the image of a displacement that grows with the third power, by that in the corner.
+# Ratio of the rms over the image to the value in its corner, of a cubic displacement.
 _OF_CORNER = 0.4
 # Share of the whole distortion by which decentring displaces a pixel in the corner. Boards hardly separate it
 # from a shift of the principal point; its coefficients p1, p2 are the tangential ones of the radtan models.

@@ -112,7 +112,7 @@ class Capture:
 
     @property
     def file_hashes(self) -> frozenset[str]:
-        """SHA-256 of every image, scan and stretch of events in it."""
+        """SHA-256 of every image, scan and range of events in it."""
         return frozenset(entry.sha256 for entry in self._manifest.files)
 
     @property

@@ -185,7 +185,7 @@ def replacing(
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
             for other in root.glob(f"{DRAFT}{folder.name}-*"):
-                # Of a killed process; those of living ones are locked.
+                # Drafts of killed processes; those of running ones are locked.
                 with suppress(OSError), _locked(other, waits=False):
                     shutil.rmtree(other, ignore_errors=True)
             draft.mkdir()

@@ -105,7 +105,7 @@ def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
 
 
 def keep_identity(earlier: Rig, rig: Rig) -> Rig:
-    """Give a profile the robot and the serial numbers that an earlier one of the same rig states."""
+    """Fill in a profile's robot and serial numbers from an earlier profile of the same rig."""
     lidars = {
         name: each.model_copy(update={"serial": each.serial or earlier.lidars[name].serial})
         for name, each in rig.lidars.items()

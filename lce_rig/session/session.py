@@ -215,7 +215,7 @@ class Session:
         return (self.path / PROFILE).read_bytes() if other is None else other.encode()
 
     def _same_rig(self, rig: Rig) -> Rig:
-        """Give another profile this session's robot and serial numbers.
+        """Fill in another profile's robot and serial numbers from this session.
 
         Raises:
             SessionError: it is of another rig.
@@ -235,7 +235,7 @@ class Session:
             write_atomically(self.path / PROFILE_TEXT, text)
 
     def profile_text(self) -> str:
-        """Give the session's profile as its author wrote it, with comments; else every value of it."""
+        """Return the session's profile as its author wrote it, with comments; else all its values."""
         with suppress(OSError, ValueError):
             text = (self.path / PROFILE_TEXT).read_text(encoding="utf-8")
             if self._says(text):
@@ -273,7 +273,7 @@ class Session:
 
     @property
     def rejected(self) -> list[Capture]:
-        """Every capture that was rejected, by name: nothing uses them, and `restore` takes one back.
+        """All rejected captures, sorted by name; they are not used, and `restore` takes one back.
 
         Raises:
             SessionError: their folder may not be read.
@@ -332,7 +332,7 @@ class Session:
         old, new = self.path / source / name, self.path / target / name
         if new.exists():
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
-        # First, so that nothing moves where the disk is full.
+        # First, so that the capture does not move if the disk is full.
         self.journal(event, capture=name, **fields)
         with writing(new):
             new.parent.mkdir(exist_ok=True)
@@ -452,7 +452,7 @@ class Session:
         return entries
 
     def cached(self, key: str) -> Path:
-        """Give the file of arrays kept under a key such as "3f9a1c/000012"."""
+        """Return the path of the arrays cached under a key such as "3f9a1c/000012"."""
         return self.path / DETECTIONS / f"{key}.npz"
 
     def _contents(self) -> dict[str, str]:
@@ -462,7 +462,7 @@ class Session:
                 try:
                     self._names_by_content.setdefault(capture.content_sha256, capture.name)
                 except SessionError:
-                    # A damaged capture is reported when it is read; nothing is a duplicate of it.
+                    # A damaged capture is reported when it is read, and has no duplicates.
                     continue
         return self._names_by_content
 
@@ -476,7 +476,7 @@ def _of_another_rig(session: Session, rig: Rig, keys: Sequence[DifferingKey], hi
 
 
 def discard_if_empty(path: Path) -> bool:
-    """Remove a session's folder if it holds nothing but the files of its creation.
+    """Remove a session's folder if it holds only the files of its creation.
 
     Args:
         path: the folder, without a writer.

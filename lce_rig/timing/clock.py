@@ -10,7 +10,7 @@ from lce_rig.core.geometry import Array
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
 FOREVER_NS = 2**62
-# A crystal's drift changes by about a part in a million as it warms up; no data say so once they have ended.
+# Change of a crystal's drift as it warms up, assumed for times outside the readings.
 WANDER = 1e-6
 
 

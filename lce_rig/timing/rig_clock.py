@@ -24,16 +24,16 @@ from lce_rig.timing.triggers import TriggerMatcher
 
 _N_EDGES = 2048
 _WINDOW_NS = 60 * NS_PER_S
-# Of the least time between two pulses: an edge farther from its pulse could be the next one's.
+# Share of the least time between two pulses within which an edge belongs to a pulse.
 _NEAR = 0.4
 _MIN_MATCHED = 0.5
-#: Pulses a second at which the first images are matched.
+#: Rate of the pulses while the first images are matched.
 SLOW_TRIGGERS_HZ = 4.0
-# A DAVIS takes the computer's time when it is opened.
+# Error of a DAVIS's clock, which is set to the computer's time when it is opened.
 _COARSE_EDGE_NS = 100_000_000.0
-# A locked VLP-16 counts whole microseconds.
+# Error of a locked VLP-16, which counts whole microseconds.
 _LOCKED_SIGMA_NS = 1_000.0
-# A board that a person moves by hand, in haste.
+# Speed of a board that is carried in haste.
 BOARD_SPEED_MPS = 1.0
 
 
@@ -226,13 +226,13 @@ class RigClock:
         return self._edge_models.get(camera), self._edges[camera].problem
 
     def problems(self) -> list[Finding]:
-        """List which clocks are not tied as they should be, and why."""
+        """List the clocks without the expected synchronisation, and why."""
         matchers = [each.problem for each in self._matchers.values()]
         edges = [each.problem for each in self._edges.values()]
         return [problem for problem in matchers + edges if problem is not None]
 
     def account(self) -> list[Finding]:
-        """List the cameras whose counts, or those of their pulses, began anew so far."""
+        """List the cameras whose counts, or those of their pulses, have restarted."""
         return [
             Finding(findings.SLIPPED.code, findings.SLIPPED.severity, name, matcher.figures())
             for name, matcher in self._matchers.items()
@@ -242,8 +242,7 @@ class RigClock:
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured.
 
-        A board that is carried moves by a metre in a second: the times must be known to within
-        quality.max_motion_m / (1 m/s).
+        A carried board moves at 1 m/s, so the times must be accurate to quality.max_motion_m / (1 m/s).
         """
         if not self._has_board:
             return SyncVerdict((findings.NO_BOARD(),))

@@ -55,7 +55,7 @@ BEFORE_NS = 1_200_000_000
 AFTER_NS = 150_000_000
 """... and after its last, for the board to be followed."""
 
-# A clock that is fitted again while events come may move them back by microseconds.
+# Largest step back of events that does not count as a restart: refitting a clock moves them by microseconds.
 _MAX_BACK_NS = 1_000_000
 
 
@@ -104,7 +104,7 @@ class EventBuffer:
         self._streams: dict[str, _Stream] = {}
 
     def add(self, events: Events) -> None:
-        """Take a camera's next packet, not empty; a clock that was set back begins its stream again."""
+        """Take a camera's next packet, not empty; the stream restarts if its clock was set back."""
         first_ns, stream = int(events.t_ns[0]), self._streams.get(events.sensor)
         if stream is None or first_ns < stream.last_ns - _MAX_BACK_NS:
             offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
@@ -115,7 +115,7 @@ class EventBuffer:
         stream.last_ns = int(events.t_ns[-1])
 
     def forget_before(self, time_ns: int) -> None:
-        """Drop the packets before a time of the rig's clock, but the last of each stream."""
+        """Drop the packets before a time of the rig's clock, except the last of each stream."""
         for stream in self._streams.values():
             packets, until_ns = stream.packets, time_ns - stream.offset_ns
             while len(packets) > 1 and packets[0].t_ns[-1] < until_ns:
@@ -156,7 +156,7 @@ class _Stream:
 
 
 PATIENCE_NS = 1_000_000_000
-#: How long events wait for a scan: in a bag, scans are late by up to two seconds beside their own waiting.
+#: Time for which events are kept for scans, which in a bag may be up to two seconds late.
 IN_BAGS_NS, LIVE_NS = 3 * PATIENCE_NS, 3 * PATIENCE_NS // 2
 _Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 

@@ -18,16 +18,16 @@ from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.timing import findings
 from lce_rig.timing.clock import ClockModel
 
-# VersaVIS, too, asks for four in a row.
+# Images in a row that must agree on the constant; VersaVIS requires four, too.
 N_AGREE = 4
 
 _N_WAITING = 64
 _N_DELAYS = 31
-# Of the time between two pulses: nearer than this, an image belongs to the pulse and to no other.
+# Largest deviation of an image's delay from the median, as a share of the pulses' period.
 _NEAR = 0.3
 _N_PULSES = 1024
 _N_RECENT = 8
-# From a pulse to the next whose line came, at most, for those between to be placed between the two.
+# Largest difference in number of two received pulses between which missing ones are interpolated.
 _MAX_STEPS = 8
 
 
@@ -130,7 +130,7 @@ class TriggerMatcher:
             frame = self._waiting[0]
             last_count, last_ns = next(reversed(self._pulses.items()))
             if self._constant is None:
-                # Only when the pulses have come past an image's time are all that could be its own known.
+                # All candidate pulses are known only once the pulses have passed the image's time.
                 if last_ns <= frame.board_ns:
                     return
                 yield from self._seek(self._waiting.popleft())
@@ -143,7 +143,7 @@ class TriggerMatcher:
         """Look for the constant: the same for several images in a row, each with one possible pulse."""
         window_ns = self._max_delay_ns
         possible = [n for n, ns in self._pulses.items() if 0 <= frame.board_ns - ns <= window_ns]
-        # A pulse lost on the way is missing among the possible, and makes another look like the only one.
+        # If a pulse was lost on the way, another one may look like the only candidate.
         is_ambiguous = len(possible) > 1 or self._period_ns() < window_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:

@@ -16,7 +16,7 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 STEP_M = 0.6
 MOST_AT_ONCE = 3
-#: Smaller differences are not mentioned: people cannot follow them, or need not.
+#: Differences, m and deg, below which no instruction is given: people cannot follow smaller ones.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
 #: Tolerance of every figure of a board at its wanted pose, in dead bands.
 THERE = 1.5

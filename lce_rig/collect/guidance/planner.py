@@ -348,9 +348,9 @@ class Planner:
 
 
 _FEWEST, _MOST = 2, 6
-# Boards whose distances differ by this factor or more are near and far ones.
+# Least ratio of distances of boards that are described as near and far ones.
 _FAR = 1.4
-# A LiDAR beside the camera that looks the same way: people need no more to know where to stand.
+# Default T_cam_lidar: a LiDAR beside the camera, facing the same way; accurate enough to place a board.
 _SAME_WAY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 

@@ -40,10 +40,10 @@ from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
 
 _WAIT_S = 0.1
-# Threads that read sensors ask for the interpreter often and briefly, the loop holds it for long: at Python's
-# 5 ms guidance would be slower by a third.
+# Switch interval of threads: sensor threads need the interpreter often and briefly, the loop holds it for
+# long. At Python's 5 ms, guidance would be slower by a third.
 _TURN_S = 0.0005
-# A board that has not moved, as far as its pose is known.
+# Largest apparent motion of a board that has not moved.
 _SAME_M, _SAME_DEG = 0.02, 2.0
 
 
@@ -228,7 +228,7 @@ class _Loop:
         self._monitor.narrate(narration, guide, present)
 
     def _decide(self, moment: CaptureMoment, narration: Narration) -> Narration:
-        """Capture a moment, unless it adds nothing."""
+        """Capture a moment if it adds information."""
         detection = moment.detection
         guide = self._seeing_guide(detection)
         if guide is None:
@@ -339,7 +339,7 @@ class _Loop:
             return "enough"
         if options.idle_s is None:
             return None
-        # Nothing new was shown for long, or no new placement is left.
+        # No new placement was shown for long, or none is left.
         has_nothing_left = all(guide.is_exhausted for guide in self._guides)
         patience_s = min(options.idle_s, GIVE_UP_S) if has_nothing_left else options.idle_s
         return "exhausted" if time.monotonic() - self._captured_s > patience_s else None
@@ -351,7 +351,7 @@ class _Loop:
         lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
         goes_on = ""
         if lacking and not has_ended:
-            # It goes on for the guide that needs most captures.
+            # The guide that needs most captures gives the reason.
             most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
             goes_on = (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
         return self._monitor.state(

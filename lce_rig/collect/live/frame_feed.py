@@ -1,4 +1,4 @@
-"""Samples in, the newest frame out: paired in a thread of its own, so that slow detection stops nothing."""
+"""Pair samples into frames in a separate thread, so that slow detection delays no sensor."""
 
 import threading
 import time

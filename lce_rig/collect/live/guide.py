@@ -35,10 +35,10 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 
-#: Another placement is proposed after a board was wanted at one for so long.
+#: Time after which another placement is proposed if the board has not reached the wanted one.
 GIVE_UP_S = 30.0
-# Two LiDARs are then known to each other within 0.04 deg and 2 mm in simulations, two cameras within 0.04 deg
-# and 8 mm.
+# Captures of two sensors of one kind that are enough: in simulations, two LiDARs are then calibrated to
+# 0.04 deg and 2 mm, two cameras to 0.04 deg and 8 mm.
 _ENOUGH_OF_PEERS = 12
 
 
@@ -113,7 +113,7 @@ class Guide:
 
     @property
     def need(self) -> float:
-        """How far the captures are from enough: 1 where the target is predicted to be met."""
+        """Need of more captures: 1 if the target is just met by prediction, larger before."""
         if self.guidance is None:
             return (self._n_enough if self.is_of_peers else self._min_captures) / max(self.n_held, 0.5)
         return max(
@@ -396,14 +396,14 @@ def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration
 
 
 def _next(guide: Guide, present: Array, otherwise: str) -> str:
-    """Say how to go on to the wanted placement; something else where the board is there, or none is known."""
+    """Return the next instruction; the fallback if the board is there or no placement is planned."""
     if guide.wanted is None:
         return _ELSEWHERE if guide.guidance is None else otherwise
     instructions = guide.instruct(present)
     return say(instructions) if instructions else otherwise
 
 
-#: A live moment waits for a better one of its place no longer than this.
+#: Longest time for which a live moment waits for a better one of its place.
 LIVE_PATIENCE_S = 0.7
 
 

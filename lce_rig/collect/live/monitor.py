@@ -20,19 +20,19 @@ _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
 _MET, _COUNTED = "the target is predicted to be met", "enough placements"
 _WAIT = "waiting for the sensors"
-# Without a frame for so long, the last detection is out of date.
+# Age at which the last detection is out of date.
 _STALE_S = 2.0
 
 
 class Monitor:
-    """Remembers the latest of everything.
+    """Keeps the latest detection, sensor states and messages for the views.
 
     Attributes:
         reasons: why the board is not seen, by the stream's name.
     """
 
     def __init__(self, session: Session, options: LiveOptions, feed: FrameFeed) -> None:
-        """Begin with nothing seen."""
+        """Begin without a detection."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
         self._options = options

@@ -72,7 +72,7 @@ class SimulatedSource(LiveSource):
         self._taken.close()
 
     def describe(self) -> SourceStatus:
-        """Say how the sensor does."""
+        """Report the state of the sensor."""
         clock, n_lost = CLOCK_SIMULATED(), self._taken.n_dropped[self.sensor]
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, device="simulated")
 

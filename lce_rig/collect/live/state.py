@@ -30,21 +30,21 @@ class TakeBack:
     name: str = ""
 
 
-#: How long a board stands still before it is captured, beyond the first half second.
+#: Time for which a board stands still before its capture, beyond the first half second.
 HOLD_S = 1.5
 
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """How a live collection goes.
+    """Options of a live collection.
 
     Attributes:
-        n_wanted: captures that the session is to hold; None until the target is predicted to be met.
-        timeout_s: ends after so long; None never.
-        hold_s: how long a board stands still before it is captured, beyond the first half second.
-        lost_s: how long a lost sensor is waited for.
-        goes_on: whether to go on when the target is met, until asked to stop.
-        idle_s: ends after so long without a capture, for unattended runs; None never.
+        n_wanted: number of captures in the session at which to end; None to end at the target accuracy.
+        timeout_s: longest duration; None without limit.
+        hold_s: time for which a board stands still before its capture, beyond the first half second.
+        lost_s: time to wait for a lost sensor.
+        goes_on: whether to continue after the target is met, until asked to stop.
+        idle_s: longest time without a capture, for unattended runs; None without limit.
     """
 
     n_wanted: int | None = None
@@ -56,7 +56,7 @@ class LiveOptions:
 
     @property
     def is_open(self) -> bool:
-        """Whether to go on when the target is predicted to be met."""
+        """Whether to continue once the target is predicted to be met."""
         return self.goes_on or self.n_wanted is not None
 
 
