@@ -1,4 +1,4 @@
-"""The board searched for by another process: in the newest frame of a live rig, or ahead in a recording."""
+"""Board search in a separate process: in the newest frame of a live rig, or ahead in a recording."""
 
 import time
 from collections import deque

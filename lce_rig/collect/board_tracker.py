@@ -1,4 +1,4 @@
-"""The board followed from frame to frame, in every image and scan."""
+"""Tracking of the board from frame to frame, in every image and scan."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -122,7 +122,7 @@ class BoardTracker:
             if last is None and not _is_due(self._searched_ns, key, frame.time_ns, _SEARCH_S):
                 continue
             if last is not None:
-                # A board just lost is soon seen again by a quick search.
+                # A quick search usually finds a board that was just lost.
                 self._thorough_ns[key] = frame.time_ns
             is_thorough = _is_due(self._thorough_ns, key, frame.time_ns, self.thorough_interval_s)
             search = self.finder.search_image(image, last, is_thorough=is_thorough)
@@ -155,12 +155,12 @@ class BoardTracker:
         for key in detection.images:
             self._unseen.pop(key, None)
         if not detection.images and not are_scans_enough:
-            self._n_candidates.clear()  # A board that comes back is searched for at once.
+            self._n_candidates.clear()  # A board that returns is searched for at once.
             self.refusals.add(self._explain_none(detection))
         return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def _explain_none(self, detection: BoardDetection) -> Refusal:
-        """Return why no board of a frame is usable: the one that is there is refused, or there is none.
+        """Return why a frame has no usable board: the refusal of one in an image, else that none was found.
 
         Frames between two searches of an image have the reason of the earlier one.
         """
@@ -200,7 +200,7 @@ class BoardTracker:
     def _find_elsewhere(
         self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
     ) -> Refusal | None:
-        """Find whether the candidates in the scans are other things than the board in the images.
+        """Refuse scans in which all candidates are other things than the board in the images.
 
         Nominal extrinsics may be wrong: they decide for a camera and a LiDAR once they have fitted a moment.
         """
@@ -235,7 +235,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Check whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has passed since the last time for a key, and if so note the new time."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False

@@ -1,4 +1,4 @@
-"""Images for cameras that send events only: reconstructed as the stream runs, one for every scan."""
+"""Images of event cameras, reconstructed from the stream, one for every scan."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
@@ -48,7 +48,7 @@ def with_event_pictures(
 
 
 class _Darkroom:
-    """Events of one camera that wait until it is known which images are wanted of them."""
+    """Events of one camera, waiting for the times of the images to reconstruct."""
 
     def __init__(self, rig: Rig, camera: str, tally: Losses, is_live: bool) -> None:
         channel = event_channel(rig, camera) or ""
@@ -64,7 +64,7 @@ class _Darkroom:
         self._newest_ns = -(2**62)
 
     def take(self, sample: Sample) -> Iterator[Image]:
-        """Take the next sample and give the images that can be made by now."""
+        """Take the next sample and yield the images that can be reconstructed now."""
         if isinstance(sample, Events) and sample.sensor == self._camera:
             self._packets.append(sample)
         elif isinstance(sample, Scan):

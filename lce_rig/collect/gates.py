@@ -123,7 +123,7 @@ class StillnessGate:
         """Put a detection into the window and measure how far the board moved in it."""
         window = self._window
         now_ns, window_ns = detection.frame.time_ns, self._window_ns
-        # Start again after a gap, or where the clock was set back.
+        # Start again after a gap, or if the clock was set back.
         if not detection.is_usable or (window and not 0 < now_ns - window[-1].frame.time_ns < window_ns):
             window.clear()
         if detection.is_usable:
@@ -144,7 +144,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
         # Without markers the order may start at the other end: a symmetric pattern has no unique top, and
-        # pictures of events can have the colours of its squares wrong.
+        # reconstructed images may have the colours of its squares inverted.
         steps = (1,) if board.has_markers else (1, -1)
         shift_px = max(
             min(_rms(corners[::step] - reference.corners_px) for step in steps) for corners in others
@@ -274,7 +274,7 @@ def _judge_camera(
     if motion is None:
         return None
     image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
-    # Frames and events of one camera may have clocks, or delays, of their own.
+    # Frames and events of one camera may have different clocks or delays.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
     # Count the events per pixel of the board in the second before its image.
@@ -345,7 +345,7 @@ class MotionGate:
         self._rig, self._taken, self._tally = rig, taken, tally
         self._takes_frames = takes_frames
         self._half_ns, self._patience_ns = SPEED_WINDOW_S * 0.5e9, patience_s * 1e9
-        # The last of those near in time wait for their neighbours, and moments for better ones.
+        # The last detections wait for later ones near in time, and moments for better ones.
         self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0
         self._pending: deque[CaptureMoment] = deque()
@@ -418,7 +418,7 @@ class MotionGate:
 def find_moments(
     detections: Iterable[BoardDetection], gate: StillnessGate | MotionGate
 ) -> Iterator[CaptureMoment]:
-    """Yield the moments of a recording; they depend on it alone, so that a second run finds the same."""
+    """Yield the moments of a recording; a second run finds the same ones."""
     for detection in detections:
         yield from gate.take(detection)
     yield from gate.finish()

@@ -68,7 +68,7 @@ class CollectReport:
     longest_s: float = 0.0
 
     def note(self, notes: Iterable[str]) -> None:
-        """Keep notes, each once."""
+        """Add notes, each once."""
         self.notes.extend(note for note in notes if note not in self.notes)
 
 
@@ -178,7 +178,7 @@ class _Collector:
         for capture in [*self._session.captures, *rejected]:
             with suppress(LceRigError):  # A damaged capture is named when it is used.
                 known.add(capture.name, capture_poses(capture, self._session))
-        # A camera that sends events and no images is watched in images reconstructed as the stream runs.
+        # For cameras that send events only, images are reconstructed as the stream runs.
         with_images = {stream.sensor for stream in recording.streams if stream.kind == "images"}
         events = [stream for stream in recording.streams if stream.kind == "events"]
         reconstructed = {(s.sensor, s.channel) for s in events if s.sensor not in with_images}
@@ -210,7 +210,7 @@ class _Collector:
         if cameras:
             samples = with_event_pictures(samples, rig, cameras, losses)
         tracker = BoardTracker(rig, _THOROUGH_S, refusals=losses)
-        # Scans without an image made of events are counted by `with_event_pictures`.
+        # Scans without a reconstructed image are counted by `with_event_pictures`.
         check = EventsCheck(rig)
         frames = check.watch(pair_by_time(samples, rig, Losses() if cameras else losses))
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
@@ -233,7 +233,7 @@ class _Collector:
         self.report.note(finding.sentence for finding in check.findings())
 
     def finish(self) -> CollectReport:
-        """Close the books.
+        """Complete the report.
 
         Raises:
             SourceError: nothing could be read and the session is empty.
@@ -295,7 +295,7 @@ class _Collector:
         self.report.captured.append(name)
 
     def _compare_beams(self, scan: Scan) -> None:
-        """Note once where a LiDAR's rings are not those of its model."""
+        """Note once if a LiDAR's rings are not those of its model."""
         if scan.sensor not in self._compared:
             self._compared.add(scan.sensor)
             found = compare_beams(scan, self._session.rig.lidars[scan.sensor])

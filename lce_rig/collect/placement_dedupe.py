@@ -1,4 +1,4 @@
-"""Whether the board stands differently from every capture before."""
+"""Check of whether the board's placement differs from those of all captures."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -28,7 +28,7 @@ def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: floa
 
 
 class Placements:
-    """Poses of the board that were taken already, as each camera saw it.
+    """Poses of the captured boards, by camera.
 
     Args:
         min_move_m, min_turn_deg: a board that moved or turned as far stands somewhere new.
@@ -40,7 +40,7 @@ class Placements:
         self._poses: dict[str, Mapping[ImageKey, Array]] = {}
 
     def add(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
-        """Remember poses T_cam_board (4, 4) of a capture."""
+        """Add the poses T_cam_board (4, 4) of a capture."""
         self._poses[name] = poses
 
     def remove(self, name: str) -> None:
@@ -59,12 +59,12 @@ class Placements:
 
 
 def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:
-    """List where each camera, or without cameras each LiDAR, saw the board, for a capture's meta data."""
+    """List the board's pose by camera, or without cameras by LiDAR, for a capture's metadata."""
     return {"T_cam_board": {".".join(key): np.round(T, 9).tolist() for key, T in sorted(poses.items())}}
 
 
 def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
-    """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel); or each LiDAR.
+    """Find the board's pose by (camera, channel), T_cam_board (4, 4), or by LiDAR.
 
     Raises:
         SessionError: the capture is damaged, or of another rig.

@@ -17,7 +17,7 @@ class LceRigError(Exception):
 
     Args:
         what: the fault and its place (file and key, sensor, capture), one line.
-        hint: the action; empty if the fault implies it.
+        hint: the action; empty if the first line already states it.
     """
 
     exit_code = 1

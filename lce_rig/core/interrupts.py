@@ -84,7 +84,7 @@ def watch_for_interrupts() -> None:
         hook = sys.unraisablehook
 
         def leave_out_interrupts(unraisable: Any) -> None:
-            # They reached code that cannot raise them; the watch ends the program then.
+            # Interrupts in code that cannot raise them; the watch then ends the program.
             if not issubclass(unraisable.exc_type, KeyboardInterrupt):
                 hook(unraisable)
 

@@ -142,7 +142,7 @@ class DavisSource(LiveSource):
         if frame is not None:
             samples.append(self._to_image(frame, host_ns))
         for trigger in (self._input.getNextTriggerBatch() or ()) if self._has["pulses"] else ():
-            if trigger.type.name == _RISING:  # Others are of the camera's own making.
+            if trigger.type.name == _RISING:  # The camera generates others itself.
                 samples.append(Pulse(self.sensor, trigger.timestamp * NS_PER_US, self._n_pulses, host_ns))
                 self._n_pulses += 1
         if self._has["imu"]:
@@ -230,7 +230,7 @@ def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
 
 
 def _set_up(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Finding]:
-    """Set exposure, frame interval and biases as the profile says, and switch the trigger input on."""
+    """Apply the profile's exposure, frame interval and biases, and switch the trigger input on."""
     biases = {f"bias_{name.lower()}": bias for name, bias in camera.Davis346BiasCF.__members__.items()}
     durations = {
         "exposure_us": (camera.setExposureDuration, camera.getExposureDuration),

@@ -276,7 +276,7 @@ class BoardState:
             case TimeReply(cookie, rx_us, tx_us) if self._asked is not None and self._asked[0] == cookie:
                 sent_ns, self._asked = self._asked[1], None
                 self.round_trip_ns = arrival.host_ns - sent_ns - 1000 * (tx_us - rx_us)
-                # A clock that is set between question and answer spoils both.
+                # If the clock is set between request and reply, both readings are unusable.
                 if 0 <= self.round_trip_ns <= _MAX_ROUND_TRIP_NS:
                     middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
                     self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)

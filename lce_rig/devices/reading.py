@@ -248,7 +248,7 @@ class LiveSource(ABC):
         )
 
     def note_heard(self) -> None:
-        """Call the device alive, though no sample is complete yet."""
+        """Note that the device is alive, though no sample is complete yet."""
         self._heard_s = time.monotonic()
 
     @property
@@ -287,7 +287,7 @@ class LiveSource(ABC):
                 self._inbox.put(self.sensor, came, self._n_slots)
                 self._rate.add(len(came))
                 heard_s, has_sent = now_s, True
-                # Back only now: a program that can be started may still find no camera.
+                # Reopened only with the first sample: a program that starts may still find no camera.
                 self.lost = None
             elif now_s - max(heard_s, self._heard_s) > self._silence_s:
                 return self.explain_silence(has_sent=has_sent)
@@ -365,5 +365,5 @@ class AttachedSensors:
         return {name: why for name, why in lost.items() if why is not None}
 
     def statuses(self) -> dict[str, SourceStatus]:
-        """Ask every sensor how it does."""
+        """Return the state of every sensor."""
         return {name: source.status() for name, source in self.sources.items()}

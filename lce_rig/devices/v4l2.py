@@ -267,7 +267,7 @@ class V4l2Source(LiveSource):
         )
 
     def _set_up_images(self) -> PixelDecoder:
-        """Agree on the form of the images.
+        """Negotiate the format of the images.
 
         Raises:
             SourceError: another size than the intrinsics', or no pixel format that is read here.
@@ -330,7 +330,7 @@ class V4l2Source(LiveSource):
         return [Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)]
 
     def _read_exposure(self) -> None:
-        """Ask for the exposure, which automatics may change at any time."""
+        """Read the exposure, which automatic modes may change at any time."""
         self._exposure_read_s = time.monotonic()
         wanted_us = self._settings.driver.frame_timing.exposure_us
         self._exposure_us = read_exposure_us(self._device, self._known) if wanted_us is None else wanted_us

@@ -66,7 +66,7 @@ class VideoDevice:
         ioctl(self._fd, code, what, True)
 
     def grants(self, code: int, what: Structure | c_int32) -> bool:
-        """Ask the kernel for something that it may refuse; says whether it did not."""
+        """Make a request that the kernel may refuse; return whether it succeeded."""
         try:
             self.ioctl(code, what)
         except OSError:
@@ -74,7 +74,7 @@ class VideoDevice:
         return True
 
     def close(self) -> None:
-        """Stop, give the buffers back and close."""
+        """Stop, release the buffers and close."""
         if self._fd >= 0:
             self.stop()
             os.close(self._fd)
@@ -90,7 +90,7 @@ class VideoDevice:
         return codes
 
     def set_layout(self, code: str, width: int, height: int) -> tuple[tuple[str, int, int], int]:
-        """Ask for a form of images.
+        """Request a pixel format and size of images.
 
         Returns:
             The pixel format and size, px, that will be delivered, and the bytes from row to row.
@@ -110,7 +110,7 @@ class VideoDevice:
         return (granted, pix.width, pix.height), pix.bytesperline
 
     def set_rate(self, rate_hz: float) -> None:
-        """Ask for images a second; the device may choose another rate."""
+        """Request a rate of images, Hz; the device may choose another."""
         ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
         self.grants(abi.SET_PARAMETERS, ask)
 
@@ -219,7 +219,7 @@ def video_devices() -> list[str]:
 
 
 def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
-    """Return the serial number of the USB device behind a video device; "" where the kernel knows none.
+    """Return the serial number of the USB device behind a video device; "" if the kernel knows none.
 
     Args:
         name: of the video device: "video0".
@@ -290,7 +290,7 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
 
 
 def read_control(device: VideoDevice, setting: Control) -> int | None:
-    """Read one setting; None where the device does not say."""
+    """Read one setting; None if the device does not report it."""
     number, kind = setting
     control = abi.V4l2Control(id=number)
     if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):

@@ -90,7 +90,7 @@ class Vlp16Source(LiveSource):
                 raise self.explain_silence(has_sent=False)
 
     def read(self) -> list[Scan]:
-        """Take the packets that came, and give the scans that they complete.
+        """Read the packets received, and return the scans that they complete.
 
         Raises:
             SourceError: the network failed.

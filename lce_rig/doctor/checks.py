@@ -48,7 +48,7 @@ _ROOM, _MAX_UNLIKE = 2, 0.01
 
 
 def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Measure the free space of a folder's disk, and how fast it takes data that are flushed to it."""
+    """Measure the free space of a folder's disk, and its rate of writing flushed data."""
     folder = exam.folder.absolute()
     folder = next(path for path in (folder, *folder.parents) if path.exists())
     try:
@@ -74,7 +74,7 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 
 def check_computer_clock(_exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Ask the kernel whether something keeps the computer's clock right; a VLP-16's hour is taken from it."""
+    """Ask the kernel whether the computer's clock is synchronised; a VLP-16's hour is taken from it."""
     timex = (ctypes.c_long * _TIMEX_LONGS)()
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state in (-1, _TIME_ERROR):
@@ -148,7 +148,7 @@ def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
 
 
 def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
-    """Judge how many scans or images a second came.
+    """Judge the rate of scans or images.
 
     A LiDAR's rate is its rotor's speed, by its own clock: scans arrive late on a busy computer.
     """
@@ -260,7 +260,7 @@ def _count(samples: Sequence[Pulse | Image], first_ns: int, last_ns: int) -> int
 
 
 def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Fit the clock of a camera that sees the board's pulses to them."""
+    """Fit the clock of a camera that sees the board's pulses to these pulses."""
     board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = exam.driver(sensor) == "davis"
     if not is_davis or seen.status is None or board is None or board.status is None:
@@ -299,7 +299,7 @@ def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 
 def tie(exam: Examination) -> RigClock:
-    """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
+    """Convert every possible sensor to the rig's clock, as `collect` does with the same samples."""
     board = exam.seen.get(BOARD)
     has_board = board is not None and board.status is not None
     cameras = [name for name in exam.rig.cameras if exam.driver(name) == "davis"]

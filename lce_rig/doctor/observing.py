@@ -1,4 +1,4 @@
-"""All sensors of a rig watched side by side for some seconds; one that is absent keeps no other from it."""
+"""Watch all sensors of a rig at the same time for some seconds; an absent one does not stop the others."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

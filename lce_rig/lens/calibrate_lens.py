@@ -157,7 +157,7 @@ def _variances(setup: Setup, state: LensState) -> Array:
 
 
 def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
-    """Return each board the median of its channel (K,)."""
+    """Return for each board the median of its channel (K,)."""
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 

@@ -123,7 +123,7 @@ class Capture:
 
     @property
     def times_ns(self) -> list[int]:
-        """When its samples arrived, on this computer's clock; their own timestamps where that is unknown."""
+        """Times of arrival of its samples, on this computer's clock; their timestamps if unknown."""
         files = self._manifest.files
         arrivals = [entry.host_ns for entry in files if entry.host_ns is not None]
         stamps = [entry.last_ns if entry.kind == "events" else entry.stamp_ns for entry in files]

@@ -25,7 +25,7 @@ def provenance_of(session: Session) -> Provenance:
         SessionError: two units of one sensor took the captures.
     """
     date, imported = date_of(session), []
-    # When a capture came into the session, by its journal.
+    # Time at which a capture was added to the session, from its journal.
     for entry in [] if date else session.read_journal():
         if entry.get("event") == CAPTURED:
             with suppress(TypeError, ValueError, OverflowError):

@@ -391,7 +391,7 @@ class Session:
         return name
 
     def add_session(self, other: "Session") -> list[str]:
-        """Copy the captures of another session of this rig, but those that this one holds or has rejected.
+        """Copy the captures of another session of this rig, except those that this one holds or has rejected.
 
         Args:
             other: of the same board and sensors; limits and targets may differ.
@@ -418,7 +418,7 @@ class Session:
 
     @property
     def next_name(self) -> str:
-        """The name of the next capture; that of a rejected one is not given again."""
+        """Name of the next capture; names of rejected ones are not reused."""
         return f"{max((int(each.name) for each in self.captures + self.rejected), default=-1) + 1:06d}"
 
     def _require_lock(self) -> None:

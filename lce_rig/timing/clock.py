@@ -48,7 +48,7 @@ class ClockModel:
 
     @staticmethod
     def identity(sigma_ns: float, origin: str) -> "ClockModel":
-        """Build the model of a clock that shows the reference's time already.
+        """Build the model of a clock that already shows the reference's time.
 
         Args:
             sigma_ns: how well it does.
@@ -114,7 +114,7 @@ class ClockModel:
 
 
 def resolve_hour(past_hour_ns: int, near_ns: int) -> int:
-    """Complete a time that is known past the hour only.
+    """Complete a time that is known only within the hour.
 
     Args:
         past_hour_ns: time since the full hour; may exceed an hour where a counter has not wrapped yet.

@@ -94,7 +94,7 @@ def fit_clock(
 def match_edges(
     source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
 ) -> tuple[Stamps, Stamps]:
-    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
+    """Match edges timestamped by one clock to those of another, by a coarse model of the two.
 
     Args:
         source_ns: (N,) edges on the one clock; rising.
@@ -211,7 +211,7 @@ class LineFit:
 
 
 def median_slope(x: Array, y: Array) -> float:
-    """Compute the median slope between points half the data apart; bears a quarter of outliers.
+    """Compute the median slope between points half the data apart; robust to a quarter of outliers.
 
     References:
         Theil, "A rank-invariant method of linear and polynomial regression analysis", 1950 (method I).
@@ -288,7 +288,7 @@ class ClockTracker:
 
     @property
     def model(self) -> ClockModel | None:
-        """The model of the readings so far; None while there are too few."""
+        """The model of the readings so far; None with too few."""
         return self._latest(max_new=1)
 
     def restart(self) -> None:
@@ -317,7 +317,7 @@ class ClockTracker:
             self._step(self._suspects, round(float(np.median(sizes_ns))))
 
     def _step(self, pairs: list[_Pair], size_ns: int) -> None:
-        """Begin a new model with the readings that prove a jump."""
+        """Start a new model with the readings that prove a jump."""
         self.steps.append(ClockStep(pairs[0].source_ns, size_ns))
         self.restart()
         self._pairs.extend(pairs)

@@ -44,7 +44,7 @@ class SyncVerdict(NamedTuple):
 
     @property
     def requires_still_boards(self) -> bool:
-        """Whether they must."""
+        """Whether boards must stand still."""
         return bool(self.reasons)
 
     @property
@@ -172,7 +172,7 @@ class RigClock:
         return any(matcher.problem is not None for matcher in self._quick)
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
-        """Take a sample of a source, and give those whose time is now known, on the rig's clock."""
+        """Take a sample of a source, and return those whose time is now known, on the rig's clock."""
         if isinstance(sample, Pulse):
             return self._take_pulse(source, sample)
         matcher = self._matchers.get(sample.sensor)
@@ -222,7 +222,7 @@ class RigClock:
             self._tie(name, None if model is None else model.then(board_clock))
 
     def edge_clock(self, camera: str) -> tuple[ClockModel | None, Finding | None]:
-        """Return the board's time on the clock of a camera that stamps its edges; or why there is none."""
+        """Return the board's time on the clock of a camera that timestamps its edges, or the problem."""
         return self._edge_models.get(camera), self._edges[camera].problem
 
     def problems(self) -> list[Finding]:

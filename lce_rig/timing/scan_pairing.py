@@ -61,7 +61,7 @@ _MAX_BACK_NS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class EventCut:
-    """A stretch of one camera's stream.
+    """A range of one camera's stream.
 
     Attributes:
         packets: those with its events, at least one event.
@@ -97,7 +97,7 @@ class EventCut:
 
 
 class EventBuffer:
-    """Holds the packets of every event camera, and hands out those around a scan without copying."""
+    """Holds the packets of every event camera, and returns those around a scan without copying."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -198,7 +198,7 @@ def pair_by_time(
     Args:
         samples: images, scans and packets of events; each sensor's timestamps rise.
             rig: the profile, with time offsets and the tolerance of pairs.
-            losses: counts the scans without an image within the tolerance, with the nearest image's distance.
+            losses: counts the scans without an image within the tolerance, with the least time difference.
             events_wait_ns: time for which events are kept for scans that wait or come late.
             are_events_enough: whether a scan with events but without an image is a frame, too.
     """
@@ -308,7 +308,7 @@ class _Pairing:
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
-    """Find the rig's time at the middle of a scan; None where the scan carries no timestamp."""
+    """Find the rig's time at the middle of a scan; None without a timestamp."""
     time_ns = rig_time_ns(scan, rig)
     return None if time_ns is None else time_ns + _half_sweep_ns(scan, rig)
 

@@ -85,11 +85,11 @@ class TriggerMatcher:
         self._last: tuple[int, int] | None = None
 
     def set_clock(self, board_from_camera: ClockModel) -> None:
-        """Take the board's time on the camera's clock, by which the start is found."""
+        """Take the board's time on the camera's clock, used to find the constant."""
         self._clock = board_from_camera
 
     def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
-        """Take a pulse, and give the images that waited for it."""
+        """Take a pulse, and return the images that waited for it."""
         last_count, last_ns = next(reversed(self._pulses.items()), (pulse.count - 1, 0))
         if pulse.count <= last_count:
             if self._pulses.get(pulse.count) == pulse.stamp_ns:
@@ -106,7 +106,7 @@ class TriggerMatcher:
         return list(self._proceed())
 
     def take_image(self, image: Image) -> list[TriggeredImage]:
-        """Take an image, and give those whose pulses are now known."""
+        """Take an image, and return those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self.counts["n_unmatched"] += 1
             is_numbered = image.count is not None
@@ -165,7 +165,7 @@ class TriggerMatcher:
                 yield self._matched(each, each.number - constant)
 
     def _follow(self, frame: _Waiting, constant: int) -> Iterator[TriggeredImage]:
-        """Match by number, and keep an eye on the time."""
+        """Match by number, and check the time."""
         number = frame.number - constant
         if number not in self._pulses:
             self.counts["n_unmatched"] += 1

@@ -66,7 +66,7 @@ def describe_pose(view: SensorPlace, T_cam_board: Array) -> HeldPose:
 
 
 def build_pose(view: SensorPlace, held: HeldPose) -> Array:
-    """Put T_cam_board (4, 4) together, the inverse of `describe_pose`."""
+    """Build T_cam_board (4, 4), the inverse of `describe_pose`."""
     right, ahead = _level_axes(view)
     centre = held.right_m * right + held.ahead_m * ahead + held.up_m * view.up
     distance_m = float(np.linalg.norm(centre))

@@ -1,4 +1,4 @@
-"""The next placement, which shrinks the predicted covariance most, and those that a session lacks."""
+"""The placements that shrink the predicted covariance most: the next one, and those that a session lacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
 
 
 def _places(view: SensorPlace, T_cam_board: Array) -> Array:
-    """Where board centres lie in the image, px, and how far away they are, as a logarithm, (N, 3)."""
+    """Return the board centres' position in the image, px, and the logarithm of their distance, (N, 3)."""
     centre = T_cam_board[:, :3, 3]
     pixels, _ = view.model.lens.project(centre)
     # A centre out of sight counts as one at the image's middle.
@@ -176,7 +176,7 @@ class Planner:
         avoid: Array | None = None,
         beside: Sequence[Beside] = (),
     ) -> Guidance:
-        """Predict how well the extrinsics are known, and choose where the board should go.
+        """Predict the standard deviations of the extrinsics, and choose the next placement.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far; N may be 0.
@@ -338,7 +338,7 @@ class Planner:
         ranked = new[np.argsort(cost[new], kind="stable")]
         if present is None or not self._is_like(held, present[None]).any():
             return int(ranked[0])
-        # Move a board that stands at a capture on, not to where the instruction is "hold still".
+        # Move the board away from a captured placement, not to one whose instruction is "hold still".
         away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
         return int(next(away, ranked[0]))
 
@@ -428,7 +428,7 @@ def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, t
 
 
 def common_third(lens: Intrinsics, centres: Array) -> str:
-    """Name the outer third of the image in which all boards are; "" for none.
+    """Name the outer third of the image that contains all boards; "" for none.
 
     Args:
         lens: of the camera.

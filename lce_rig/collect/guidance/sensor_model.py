@@ -1,4 +1,4 @@
-"""The sensors as guidance knows them: how well they measure a board, and where a person can hold one."""
+"""The sensors' models for guidance: their accuracy for a board, and the placements within reach."""
 
 from dataclasses import dataclass, field, replace
 
@@ -117,7 +117,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 @dataclass(frozen=True, eq=False)
 class SensorPlace:
-    """Where the camera, the LiDAR and the ground are.
+    """Positions of the camera, the LiDAR and the ground.
 
     Attributes:
         model: the sensors.
@@ -149,7 +149,7 @@ class SensorPlace:
 
 
 def spread_candidates(view: SensorPlace, n_places: int) -> Array:
-    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over everything that is reachable.
+    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over the reachable space.
 
     Args:
         view: the sensors.

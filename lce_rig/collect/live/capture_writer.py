@@ -32,7 +32,7 @@ class Learning:
     """Calibrates the captures of each guide's sensors; open while its `with` block lasts."""
 
     def __init__(self, rig: Rig, guides: Sequence[Guide]) -> None:
-        """Prepare; no process is started before there are captures enough."""
+        """Prepare; the process starts once there are enough captures."""
         self._guides = guides
         self._min_captures = rig.quality.min_captures
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
@@ -49,13 +49,13 @@ class Learning:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End, without waiting for a calibration."""
+        """Stop, without waiting for a calibration."""
         self._is_open = False
         self._worker.__exit__(None, None, None)
         self._caller.shutdown(cancel_futures=True)
 
     def show(self, name: str, detection: BoardDetection) -> None:
-        """Take a capture's detection."""
+        """Add a capture's detection."""
         self._shown[name] = detection
         self._calibrate_again(detection)
 
@@ -106,7 +106,7 @@ class _Teacher:
         self._guides = make_guides(rig)
 
     def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
-        """Calibrate one guide's sensors; None where more captures are needed."""
+        """Calibrate one guide's sensors; None if more captures are needed."""
         guide = self._guides[k]
         tolerances = Tolerances.of(self._rig.cameras[guide.key[0]], self._rig.board)
         settings = EstimateSettings.of(CalibrateOptions(), self._rig.lidars[guide.lidar], tolerances)
@@ -147,11 +147,11 @@ class CaptureWriter:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a capture is not on the disk, or not taken back, yet."""
+        """Whether the writing or taking back of a capture is pending."""
         return self.disk.n_waiting > 0
 
     def keep(self, moment: CaptureMoment, events: Sequence[EventCut], meta: Mapping[str, object]) -> None:
-        """Have a capture written; returns at once.
+        """Queue a capture for writing; returns at once.
 
         Args:
             moment: the board in its frame, whose images are stored.

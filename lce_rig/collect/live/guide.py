@@ -128,7 +128,7 @@ class Guide:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether no placement is known that would be new."""
+        """Whether no new placement is known."""
         return self.guidance is not None and self.guidance.T_cam_board is None
 
     @property
@@ -137,7 +137,7 @@ class Guide:
         return None if self.guidance is None else self.guidance.T_cam_board
 
     def sees(self, detection: BoardDetection) -> bool:
-        """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
+        """Check whether both of its sensors see the board in a detection within the profile's limits."""
         seen = {(lidar, "") for lidar in detection.lidars} | (
             detection.images.keys() - detection.unfit.keys()
         )
@@ -202,14 +202,14 @@ class Guide:
         beside = [each for other in others if (each := self._beside(other)) is not None]
         guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         if guidance.T_cam_board is None and self._avoid:
-            # Obstacles may be gone: ask again rather than for nothing.
+            # Obstacles may be gone: propose unreachable placements again rather than none.
             del self._avoid[:-1]
             guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         self.guidance = guidance
         self._wanted_since_s = now_s
 
     def _beside(self, other: "Guide") -> Beside | None:
-        """Relate another guide that still needs captures, by the camera or the LiDAR that both have."""
+        """Relate another guide that still needs captures, by the common camera or LiDAR."""
         if self._planner is None or other._planner is None or other is self or other.is_enough:
             return None
         own, its = self._planner.view.T_cam_lidar, other._planner.view.T_cam_lidar
@@ -220,12 +220,12 @@ class Guide:
         return None
 
     def note_refusal(self, present: Array) -> None:
-        """Ask for another placement where a board (4, 4) was refused though it is as wanted."""
+        """Ask for another placement if a board (4, 4) was refused at the wanted one."""
         if self.is_there(present):
             self.give_up()
 
     def give_up(self) -> None:
-        """Ask for another placement: something is in the way of this one."""
+        """Ask for another placement: this one is out of reach."""
         if self.wanted is not None:
             self._avoid.append(self.wanted)
         self.guidance = None
@@ -352,7 +352,7 @@ _ELSEWHERE = "hold it somewhere else, tilted otherwise"
 
 @dataclass(frozen=True)
 class Narration:
-    """One moment in words.
+    """The message for one moment.
 
     Attributes:
         phase, headline, detail, hold_s: as `LiveState`.
@@ -424,7 +424,7 @@ class StillBoards:
         self._refusal: Refusal | None = None
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection; a board that is moved on before its time is not captured."""
+        """Take the next detection; a board that is moved too early is not captured."""
         moments = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
             self._is_judged = self.is_decided = False

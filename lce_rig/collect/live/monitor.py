@@ -1,4 +1,4 @@
-"""Gathers the states that views show."""
+"""The states that views show."""
 
 import time
 from collections import deque
@@ -170,7 +170,7 @@ class Monitor:
         return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 
     def _watch_sensors(self) -> None:
-        """Ask how sensors do, and log those that go and come back."""
+        """Update the states of sensors, and log those that are lost or back."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
             self._asked_s = time.monotonic()
             self._statuses = self._sensors.statuses()

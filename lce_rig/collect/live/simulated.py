@@ -68,7 +68,7 @@ class SimulatedSource(LiveSource):
         return [] if came is None else [came[1]]
 
     def close(self) -> None:
-        """End."""
+        """Stop."""
         self._taken.close()
 
     def describe(self) -> SourceStatus:
@@ -81,7 +81,7 @@ class SimulatedSource(LiveSource):
         self._taken.put(self.sensor, [sample], _N_SLOTS)
 
     def fail(self, error: SourceError) -> None:
-        """End for good."""
+        """Stop with an error."""
         self._failure = error
         self._taken.close()
 
@@ -111,7 +111,7 @@ class SimulatedRig:
             )
         self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
         self.sources: list[LiveSource] = list(self._by_sensor.values())
-        # People see the rig as its drawing has it: they do not know the true extrinsics.
+        # The person follows the nominal extrinsics, not the true ones.
         lidar = next(iter(rig.lidars))
         views = {name: SensorPlace.nominal(rig, name, lidar) for name in framed}
         self._worker = Worker("simulated rig", _Simulation, rig, seed, views)
@@ -276,7 +276,7 @@ class Walker:
                 return
 
     def walk(self, now_s: float) -> None:
-        """Go on."""
+        """Move the board to its place on the way at a time."""
         if self._way is None:
             return
         start, end, from_s, until_s = self._way
