@@ -1,1 +1,1 @@
-"""From recordings and attached sensors to a session of captures."""
+"""Collect captures into a session, from recordings or attached sensors."""

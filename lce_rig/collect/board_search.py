@@ -1,4 +1,4 @@
-"""The board searched for by another process: in the newest frame of a live rig, or ahead in a recording."""
+"""Board search in a separate process: in the newest frame of a live rig, or ahead in a recording."""
 
 import time
 from collections import deque
@@ -45,16 +45,16 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
             caller.shutdown(wait=False, cancel_futures=True)
 
 
-# Interval of thorough searches of an image without a board, which hold guidance up even longer.
+# Least interval of thorough searches of an image without a board, which delay guidance even longer.
 _THOROUGH_S = 3.0
-# Interval of searches of a scan for other things of the board's size while all known ones are followed.
+# Least interval of searches of a whole scan while all candidates are followed.
 _RESCAN_S = 1.0
-# Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
+# Least interval of both in units of the longest recent time per frame; decay of that time per frame.
 _RARE, _FORGET = 6.0, 0.95
 
 
 class BoardSearch(Worker):
-    """A `BoardTracker` in its process; frames' events, which it has no use for, stay here."""
+    """A `BoardTracker` in its own process; the frames' events are not sent to it."""
 
     def __init__(self, rig: Rig) -> None:
         """Prepare; see `BoardTracker`."""

@@ -1,4 +1,4 @@
-"""The board followed from frame to frame, in every image and scan."""
+"""Tracking of the board from frame to frame, in every image and scan."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -20,25 +20,24 @@ from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
-# Interval of searches of a whole image while no board is in sight, and of a scan while one is lost.
+# Interval between searches of a whole image without a board, and of a scan after a candidate is lost, s.
 _SEARCH_S = 0.3
-# A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
+# Factor on the tolerance of the nominal extrinsics within which a candidate counts as the camera's board.
 _NOMINAL_MARGIN = 1.5
-# Nominal extrinsics that fit a board so well at one distance fit boards at all distances.
+# Largest misfit, relative to its limit, that confirms nominal extrinsics for boards at all distances.
 _PROVED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """The board in one frame.
+    """The board detected in one frame.
 
     Attributes:
-        images: by (camera, channel), where it was found.
-        lidars: candidates that the profile's limits admit, by LiDAR; things of the board's size may be among
-            them.
-        unseen: why it was not found, by (camera, channel), where it was looked for.
-        unscanned: why there is no such candidate, by LiDAR, where it was looked for.
-        unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
+        images: detections by (camera, channel).
+        lidars: candidates within the profile's limits, by LiDAR; they may include other things of its size.
+        unseen: refusal by (camera, channel), of searched images without the board.
+        unscanned: refusal by LiDAR, of searched scans without such a candidate.
+        unfit: refusal by (camera, channel), of boards in `images` outside the profile's limits.
     """
 
     frame: Frame
@@ -50,7 +49,7 @@ class BoardDetection:
 
     @property
     def poses(self) -> dict[ImageKey, Array]:
-        """Where each camera sees it, T_cam_board (4, 4); without cameras, where each LiDAR does."""
+        """Pose by camera, T_cam_board (4, 4); without cameras by LiDAR, T_lidar_board (4, 4)."""
         if not self.images:
             return {(lidar, ""): boards[0].T_lidar_board for lidar, boards in self.lidars.items()}
         return {key: board.T_cam_board for key, board in self.images.items()}
@@ -82,15 +81,15 @@ class CaptureMoment:
 
 @dataclass
 class BoardTracker:
-    """Finds the board frame by frame, near where it was, so that a long recording is searched quickly.
+    """Finds the board frame by frame, near its last place, so that a long recording is searched quickly.
 
     Attributes:
         rig: the profile.
-        thorough_interval_s: how often an image without a board is searched thoroughly, which takes most of a
-            second; 0 for always.
-        rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
-            often as while one is lost.
-        refusals: frames in which it was not found, and boards that were found and cannot be used.
+        thorough_interval_s: interval between thorough searches of an image without a board, s, each of which
+            takes most of a second; 0 for always.
+        rescan_interval_s: interval between searches of a whole scan while all candidates are followed, s; 0
+            for the interval that applies while one is lost.
+        refusals: frames without the board, and boards that were found but are unusable.
     """
 
     rig: Rig
@@ -113,7 +112,7 @@ class BoardTracker:
         return self.sight_in_scans(self.sight_in_images(frame))
 
     def sight_in_images(self, frame: Frame) -> BoardDetection:
-        """Find the board in every image of a frame; what follows from scans is empty."""
+        """Find the board in every image of a frame; the results from scans are empty."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
         unfit: dict[ImageKey, Refusal] = {}
@@ -123,7 +122,7 @@ class BoardTracker:
             if last is None and not _is_due(self._searched_ns, key, frame.time_ns, _SEARCH_S):
                 continue
             if last is not None:
-                # A board just lost is soon seen again by a quick search.
+                # A quick search usually finds a board that was just lost.
                 self._thorough_ns[key] = frame.time_ns
             is_thorough = _is_due(self._thorough_ns, key, frame.time_ns, self.thorough_interval_s)
             search = self.finder.search_image(image, last, is_thorough=is_thorough)
@@ -137,12 +136,12 @@ class BoardTracker:
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
 
     def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
-        """Find the board in every scan too, where an image shows it, and count what cannot be used."""
+        """Find the board in every scan too if an image shows it, and count unusable boards."""
         for refusal in detection.unfit.values():
             self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
-        # Nothing is gained from scans while no camera sees the board.
+        # Scans are not needed while no camera sees the board.
         are_scans_enough = not self.rig.cameras
         for scan in detection.frame.scans if detection.images or are_scans_enough else ():
             candidates = self._find_in_scan(scan, detection.frame.time_ns)
@@ -156,12 +155,12 @@ class BoardTracker:
         for key in detection.images:
             self._unseen.pop(key, None)
         if not detection.images and not are_scans_enough:
-            self._n_candidates.clear()  # A board that comes back is searched for at once.
+            self._n_candidates.clear()  # A board that returns is searched for at once.
             self.refusals.add(self._explain_none(detection))
         return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def _explain_none(self, detection: BoardDetection) -> Refusal:
-        """Return why no board of a frame is usable: the one that is there is refused, or there is none.
+        """Return why a frame has no usable board: the refusal of one in an image, else that none was found.
 
         Frames between two searches of an image have the reason of the earlier one.
         """
@@ -173,10 +172,10 @@ class BoardTracker:
         return IMAGE_NONE.refusal()
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
+        """Search the frame of a moment without a prior, as `check` does, so that the capture is usable later.
 
         Returns:
-            The moment with what was found; or why it cannot be used.
+            The moment with the new detections, or the refusal.
         """
         detection = moment.detection
         keys = detection.images.keys()
@@ -201,7 +200,7 @@ class BoardTracker:
     def _find_elsewhere(
         self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
     ) -> Refusal | None:
-        """Find whether the candidates in the scans are other things than the board in the images.
+        """Refuse scans in which all candidates are other things than the board in the images.
 
         Nominal extrinsics may be wrong: they decide for a camera and a LiDAR once they have fitted a moment.
         """
@@ -236,7 +235,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Check whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has passed since the last time for a key, and if so note the new time."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False

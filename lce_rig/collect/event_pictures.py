@@ -1,4 +1,4 @@
-"""Images for cameras that send events only: reconstructed as the stream runs, one for every scan."""
+"""Images of event cameras, reconstructed from the stream, one for every scan."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
@@ -48,7 +48,7 @@ def with_event_pictures(
 
 
 class _Darkroom:
-    """Events of one camera that wait until it is known which images are wanted of them."""
+    """Events of one camera, waiting for the times of the images to reconstruct."""
 
     def __init__(self, rig: Rig, camera: str, tally: Losses, is_live: bool) -> None:
         channel = event_channel(rig, camera) or ""
@@ -64,7 +64,7 @@ class _Darkroom:
         self._newest_ns = -(2**62)
 
     def take(self, sample: Sample) -> Iterator[Image]:
-        """Take the next sample and give the images that can be made by now."""
+        """Take the next sample and yield the images that can be reconstructed now."""
         if isinstance(sample, Events) and sample.sensor == self._camera:
             self._packets.append(sample)
         elif isinstance(sample, Scan):
@@ -76,12 +76,12 @@ class _Darkroom:
         yield from self._develop()
 
     def finish(self) -> Iterator[Image]:
-        """Give what is left when the stream has ended."""
+        """Yield the remaining images after the end of the stream."""
         self._newest_ns = 2**62
         yield from self._develop()
 
     def _develop(self) -> Iterator[Image]:
-        # Scans come late in bags: events wait for them before the network goes on.
+        # Scans come late in bags: events wait for them before the network uses them.
         while self._wanted:
             stamp_ns = self._wanted[0] - self._offset_ns
             has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] >= stamp_ns
@@ -103,7 +103,7 @@ class _Darkroom:
             self._feed(min([self._newest_ns - PATIENCE_NS, *self._wanted]) - self._offset_ns)
 
     def _feed(self, until_ns: int) -> None:
-        """Give the network all events before a timestamp of their clock."""
+        """Feed the network all events before a timestamp of their clock."""
         while self._packets and self._packets[0].t_ns[0] < until_ns:
             packet = self._packets.popleft()
             rest = packet.between(until_ns, int(packet.t_ns[-1]) + 1)

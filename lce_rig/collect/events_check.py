@@ -1,4 +1,4 @@
-"""Events compared with the frames of the same camera: brightness changes of both at the same pixels."""
+"""Comparison of events with the frames of the same camera, by brightness changes at the same pixels."""
 
 import math
 from collections import deque
@@ -52,7 +52,7 @@ class _Change(NamedTuple):
 
 
 class EventsCheck:
-    """Compares the events of cameras with their frames while these pass."""
+    """Compares the events of cameras with their frames while the stream runs."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -75,7 +75,7 @@ class EventsCheck:
             yield frame
 
     def findings(self) -> list[Finding]:
-        """List the faults of the events' polarity and clock, by the images so far."""
+        """List faults of the events' polarity and clock, from the images so far."""
         found: list[Finding] = []
         for camera, scores in sorted(self._scores.items()):
             if len(scores) < _LEAST_PAIRS:
@@ -109,7 +109,7 @@ class EventsCheck:
             changes.append(_Change(last[0], time_ns, light - last[1]))
 
     def _compare(self, cut: EventCut, time_ns: int) -> None:
-        """Compare the changes that waited for a scan's events.
+        """Compare the pending changes with a scan's events.
 
         Raises:
             SourceError: the events are rotated or mirrored.
@@ -158,7 +158,7 @@ def _sum(packets: tuple[Events, ...], start_ns: int, end_ns: int, size: tuple[in
 
 
 def _correlation(one: Array, other: Array) -> float:
-    """Correlate two maps (H, W) ; NaN where nothing moves."""
+    """Correlate two maps (H, W); NaN if nothing moves."""
     spread = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))
     if spread == 0 or np.count_nonzero(other) < _MOVING * other.size:
         return math.nan

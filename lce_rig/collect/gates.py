@@ -37,33 +37,33 @@ from lce_rig.detect.findings import IMAGE_FLICKER
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
-# For how long a board has to stand still at least, and for how many scans.
+# Least time for which a board must stand still, in seconds and in scans.
 _WINDOW_S, _WINDOW_SCANS = 0.5, 2.5
 
 
 def stillness_window_s(rig: Rig) -> float:
-    """Return for how long a board has to stand still: LiDARs without rings accumulate scans meanwhile."""
+    """Return how long a board must stand still: LiDARs without rings accumulate scans in this time."""
     slowest_hz = min((lidar.rate_hz for lidar in rig.lidars.values() if not lidar.has_rings), default=np.inf)
     return max(_WINDOW_S, _WINDOW_SCANS / slowest_hz)
 
 
 class StillnessGate:
-    """Takes detections in order of time, and gives the stillest moment of every stretch of stillness.
+    """Picks the stillest moment of every period of stillness from detections in order of time.
 
-    It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
-    the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+    It is the middle of the window with the least motion, of those below `max_motion_m`. A period ends when
+    the board moves, is lost, or has stood for `dwell_s`; its moment is then returned once.
 
     Args:
         board: the profile's.
-        max_motion_m: how far it may move in a window; a hand never holds it quite still.
-        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
-        takes_singles: whether a detection with none in two windows before and after it is a moment, as of a
-            recording that was triggered once for each placement; nothing tells whether its board stood still.
+        max_motion_m: largest motion of the board in a window; a hand never holds it quite still.
+        dwell_s: time after which a capture is taken without waiting for the board to be moved on.
+        takes_singles: whether a detection without others in two windows before and after it is a moment, as
+            in a recording triggered once per placement; its stillness cannot be checked.
         window_s: of stillness.
 
     Attributes:
-        motion_m: how far the board moved in the last window; infinite where there is no whole one.
-        held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
+        motion_m: motion of the board in the last window; infinite without a complete window.
+        held_s: duration of the present period since its first complete window; None outside a period.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class StillnessGate:
         self._since_ns = 0
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection, and give the moment of a stretch that has ended with it."""
+        """Take the next detection; return the moment of a period that ends with it."""
         now_ns = detection.frame.time_ns
         is_apart = self._last_ns is None or now_ns - self._last_ns > 2 * self._window_ns
         alone = self._take_single() if is_apart else []
@@ -108,7 +108,7 @@ class StillnessGate:
         return alone
 
     def finish(self) -> list[CaptureMoment]:
-        """Give the moment of the stretch that lasts, where there is one, and end it."""
+        """Return the moment of the present period, if any, and end the period."""
         return [*self._take_single(), *self._end_stretch()]
 
     def _take_single(self) -> list[CaptureMoment]:
@@ -123,7 +123,7 @@ class StillnessGate:
         """Put a detection into the window and measure how far the board moved in it."""
         window = self._window
         now_ns, window_ns = detection.frame.time_ns, self._window_ns
-        # Start again after a gap, or where the clock was set back.
+        # Start again after a gap, or if the clock was set back.
         if not detection.is_usable or (window and not 0 < now_ns - window[-1].frame.time_ns < window_ns):
             window.clear()
         if detection.is_usable:
@@ -144,7 +144,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
         # Without markers the order may start at the other end: a symmetric pattern has no unique top, and
-        # pictures of events can have the colours of its squares wrong.
+        # reconstructed images may have the colours of its squares inverted.
         steps = (1,) if board.has_markers else (1, -1)
         shift_px = max(
             min(_rms(corners[::step] - reference.corners_px) for step in steps) for corners in others
@@ -170,7 +170,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
 
 
 def _square_px(corners_px: Array, board: Board) -> float:
-    """Measure the side of a square; where no two neighbours are visible, by how far corners are spread."""
+    """Return the median side of a square, px; from the spread of corners if no two neighbours are visible."""
     grid = corners_px.reshape(board.rows, board.cols, 2)
     sides = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     if np.isfinite(sides).any():
@@ -183,7 +183,7 @@ def _square_px(corners_px: Array, board: Board) -> float:
 
 
 def _rms(difference: Array) -> float:
-    """Measure the rms distance (N, 2) of corners that both images show; infinite where there are none."""
+    """Compute the rms of differences (N, 2) of the corners that both images show; infinite without any."""
     squares = np.sum(difference**2, axis=-1)
     squares = squares[np.isfinite(squares)]
     return float(np.sqrt(np.mean(squares))) if len(squares) else np.inf
@@ -192,9 +192,9 @@ def _rms(difference: Array) -> float:
 def _plane_motion_m(
     reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float, where: Array
 ) -> float:
-    """Measure by how much the plane of the nearest candidate passes by points (K, 3) of the reference.
+    """Return the largest distance of points (K, 3) of the reference from the nearest candidate's plane, m.
 
-    The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
+    The centre is accurate to a few centimetres only along the board, and serves to select the plate.
     """
     centre = reference.T_lidar_board[:3, 3]
     distances = [float(np.linalg.norm(c.T_lidar_board[:3, 3] - centre)) for c in candidates]
@@ -205,13 +205,13 @@ def _plane_motion_m(
 
 
 SPEED_WINDOW_S = 0.5
-# Neither too few events nor smear.
+# Best speed of the board: slower ones give few events, faster ones smear.
 BEST_SPEED_MPS = 0.1
 
 _LEAST_DETECTIONS = 3
-# Slower boards make no events, unless there are as many a pixel in a second as this.
+# Least events per pixel and second of a board slower than `MIN_SPEED_MPS`.
 _PLENTY_EVENTS_PX = 4.0
-# Time without any event of a camera before which the board moves, ns: its stream has ended.
+# Time without events, ns, after which the stream of a camera counts as ended if the board moves.
 _SILENT_NS = 100_000_000
 
 
@@ -227,7 +227,7 @@ def judge_detection(
         takes_frames: whether frames are a moment without events, too.
 
     Returns:
-        The moment; why it is none; or None where the tracker has counted why.
+        The moment, or its refusal; None if the tracker has counted the refusal.
     """
     cuts = {cut.sensor: cut for cut in detection.frame.events}
     if detection.images and not cuts:
@@ -274,7 +274,7 @@ def _judge_camera(
     if motion is None:
         return None
     image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
-    # Frames and events of one camera may have clocks, or delays, of their own.
+    # Frames and events of one camera may have different clocks or delays.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
     # Count the events per pixel of the board in the second before its image.
@@ -298,9 +298,9 @@ def _judge_camera(
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
-    """Fit a straight and steady way to the plate's middle: speed in m/s, and the rms distance from it in m.
+    """Fit a straight path at constant speed to the plate's middle: speed, m/s, and rms distance from it, m.
 
-    The middle is well known even where the tilt is not. None where the board was seen too seldom.
+    The middle is accurate even if the tilt is not. None if the board was detected too rarely.
     """
     seen = [s for s in around if key in s.images]
     if len(seen) < _LEAST_DETECTIONS:
@@ -313,23 +313,23 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-# A way that strays from a straight one by this counts as much as a speed e times too high or low.
+# Deviation from a straight path that counts as much as a speed e times too high or low.
 _UNSTEADY_M = 0.01
 
 
 class MotionGate:
-    """Takes detections in order of time, and gives the best moment of every place that the board passes.
+    """Picks the best moment of every placement that the board passes from detections in order of time.
 
     Args:
         rig: the profile.
-        taken: no placements yet; it says how far apart they must be.
-        tally: receives why other detections are no moments.
-        patience_s: for so long a moment waits for a better one of the same place.
+        taken: placements captured so far, and how far apart they must be; new ones are added.
+        tally: counts the refusals of all other detections.
+        patience_s: time for which a moment waits for a better one of the same placement.
         takes_frames: whether frames are captured where events are missing, too.
 
     Attributes:
-        judged: the last detection that could be judged: a moment that will do, or why it does not; None where
-            no camera of events saw the board.
+        judged: result for the last detection that could be judged: a usable moment, or its refusal; None if
+            no event camera saw the board.
     """
 
     def __init__(
@@ -345,13 +345,13 @@ class MotionGate:
         self._rig, self._taken, self._tally = rig, taken, tally
         self._takes_frames = takes_frames
         self._half_ns, self._patience_ns = SPEED_WINDOW_S * 0.5e9, patience_s * 1e9
-        # The last of those near in time wait for their neighbours, and moments for better ones.
+        # The last detections wait for later ones near in time, and moments for better ones.
         self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0
         self._pending: deque[CaptureMoment] = deque()
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection, and give the moments that nothing better can follow."""
+        """Take the next detection; return the moments that are final."""
         near, now_ns, moments = self._near, detection.frame.time_ns, list[CaptureMoment]()
         if near and now_ns <= near[-1].frame.time_ns:
             # The clocks were set back.
@@ -365,7 +365,7 @@ class MotionGate:
         return moments
 
     def finish(self) -> list[CaptureMoment]:
-        """Give what is left when nothing more comes."""
+        """Return the remaining moments after the last detection."""
         moments = self._judge_until(np.inf)
         self._near.clear()
         while self._pending:
@@ -373,7 +373,7 @@ class MotionGate:
         return moments
 
     def _judge_until(self, end_ns: float) -> list[CaptureMoment]:
-        """Judge the detections that wait up to a time; give the moments that nothing better came after."""
+        """Judge the waiting detections up to a time; return the moments that are final."""
         moments: list[CaptureMoment] = []
         while self._n_waiting and self._near[-self._n_waiting].frame.time_ns <= end_ns:
             detection = self._near[-self._n_waiting]
@@ -392,7 +392,7 @@ class MotionGate:
         return moments
 
     def _decide_oldest(self) -> list[CaptureMoment]:
-        """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
+        """Return the oldest moment if it is the best of its place, else drop it."""
         oldest = self._pending.popleft()
         if self._taken.has_like(oldest.detection.poses):
             return []
@@ -418,7 +418,7 @@ class MotionGate:
 def find_moments(
     detections: Iterable[BoardDetection], gate: StillnessGate | MotionGate
 ) -> Iterator[CaptureMoment]:
-    """Yield the moments of a recording; they depend on it alone, so that a second run finds the same."""
+    """Yield the moments of a recording; a second run finds the same ones."""
     for detection in detections:
         yield from gate.take(detection)
     yield from gate.finish()

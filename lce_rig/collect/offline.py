@@ -1,4 +1,4 @@
-"""Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
+"""Build a session from recordings, unattended: new placements become captures, all refusals are counted."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -35,26 +35,26 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 
-# How often an image without a board is searched thoroughly, which takes most of a second.
+# Interval of thorough searches of an image without a board, which take most of a second each.
 _THOROUGH_S = 1.0
-# A process of its own for images takes a second to start.
+# Least samples for which a separate process for images is worth its start of a second.
 _LONG_SAMPLES = 200
 
 
 @dataclass
 class CollectReport:
-    """What became of everything that was read.
+    """Outcome of collecting from recordings.
 
     Attributes:
         captured: names of the new captures.
         n_known: pairs and moments that the session holds already, among rejected captures too.
-        refused: why something became no capture, by label.
-        counts: what kept moments of a continuous recording from becoming captures.
-        notes: what was chosen, assumed or left out, in words.
-        errors: recordings that could not be read to their end; what was captured before is kept.
+        refused: refusals of image-scan pairs, by label.
+        counts: refusals of moments of continuous recordings, counted.
+        notes: choices, assumptions and skipped data, in words.
+        errors: recordings that could not be read to their end; captures made before are kept.
         n_missing: captures short of the target.
-        has_events: whether any recording held events, which make the board's motion wanted.
-        longest_s: between the first and the last scan of the longest continuous recording; 0 without any.
+        has_events: whether any recording held events, which require the board to move.
+        longest_s: time from first to last scan of the longest continuous recording; 0 without any.
     """
 
     captured: list[str] = field(default_factory=list)
@@ -68,7 +68,7 @@ class CollectReport:
     longest_s: float = 0.0
 
     def note(self, notes: Iterable[str]) -> None:
-        """Keep notes, each once."""
+        """Add notes, each once."""
         self.notes.extend(note for note in notes if note not in self.notes)
 
 
@@ -80,10 +80,11 @@ def collect(
 ) -> CollectReport:
     """Fill a session from recordings.
 
-    A folder's pairs become captures as they are. A continuous recording is cut where the board stands still
-    in every sensor that sees it, and differs from what the session holds; where it holds events, at the best
-    moment of every place that the board passes slowly, and the raw events about it are kept. Recordings of
-    the same moment by several recorders are read as one. What an earlier run captured is not captured again.
+    A folder's pairs become captures unchanged. From a continuous recording, captures are taken while the
+    board stands still in every sensor that sees it, at a placement that the session lacks. If it holds
+    events, captures are taken at the best moment of every place that the board passes slowly, and include the
+    raw events around it. Recordings of the same time by several recorders are read as one. Captures of an
+    earlier run are not made again.
 
     Args:
         session: open for writing.
@@ -92,8 +93,8 @@ def collect(
         progress: called with (done, total) samples or pairs.
 
     Raises:
-        SourceError: nothing could be read at all; it names the first file and the cause.
-        SessionError: the session cannot be written; what was captured before is safe.
+        SourceError: no recording could be read; it names the first file and the cause.
+        SessionError: the session cannot be written; captures made before are safe.
     """
     collector = _Collector(session, n_wanted, progress)
     for recording in join_recordings(recordings, session.rig):
@@ -163,21 +164,21 @@ class _Collector:
             raise failures[0]
 
     def take_moments(self, recording: ContinuousRecording) -> None:
-        """Capture the moments of a continuous recording that are worth it.
+        """Capture the usable moments of a continuous recording.
 
         Raises:
-            SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
-                came before has been captured.
+            SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: moments
+                before the damage have been captured.
         """
         require_sensors(recording, self._session.rig)
         known = Placements()
-        # Where a capture of this recording was rejected, another moment of that placement is not wanted.
+        # Skip placements whose capture of this recording was rejected.
         unwanted = {name for key, name in self._names_by_key.items() if key.startswith(f"{recording.key}:")}
         rejected = [capture for name, capture in self._rejected.items() if name in unwanted]
         for capture in [*self._session.captures, *rejected]:
             with suppress(LceRigError):  # A damaged capture is named when it is used.
                 known.add(capture.name, capture_poses(capture, self._session))
-        # A camera that sends events and no images is watched in images reconstructed as the stream runs.
+        # For cameras that send events only, images are reconstructed as the stream runs.
         with_images = {stream.sensor for stream in recording.streams if stream.kind == "images"}
         events = [stream for stream in recording.streams if stream.kind == "events"]
         reconstructed = {(s.sensor, s.channel) for s in events if s.sensor not in with_images}
@@ -197,7 +198,7 @@ class _Collector:
     def _moments(
         self, recording: ContinuousRecording, cameras: set[str], *, has_events: bool
     ) -> Iterator[CaptureMoment]:
-        """Yield confirmed moments: by motion where there are events, else by stillness.
+        """Yield confirmed moments: selected by motion in recordings with events, else by stillness.
 
         Args:
             recording: is read once.
@@ -209,7 +210,7 @@ class _Collector:
         if cameras:
             samples = with_event_pictures(samples, rig, cameras, losses)
         tracker = BoardTracker(rig, _THOROUGH_S, refusals=losses)
-        # Scans without an image made of events are counted by `with_event_pictures`.
+        # Scans without a reconstructed image are counted by `with_event_pictures`.
         check = EventsCheck(rig)
         frames = check.watch(pair_by_time(samples, rig, Losses() if cameras else losses))
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
@@ -232,7 +233,7 @@ class _Collector:
         self.report.note(finding.sentence for finding in check.findings())
 
     def finish(self) -> CollectReport:
-        """Close the books.
+        """Complete the report.
 
         Raises:
             SourceError: nothing could be read and the session is empty.
@@ -294,7 +295,7 @@ class _Collector:
         self.report.captured.append(name)
 
     def _compare_beams(self, scan: Scan) -> None:
-        """Note once where a LiDAR's rings are not those of its model."""
+        """Note once if a LiDAR's rings are not those of its model."""
         if scan.sensor not in self._compared:
             self._compared.add(scan.sensor)
             found = compare_beams(scan, self._session.rig.lidars[scan.sensor])

@@ -1,4 +1,4 @@
-"""Whether the board stands differently from every capture before."""
+"""Check of whether the board's placement differs from those of all captures."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,7 +19,7 @@ MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
 
 
 def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: float) -> NDArray[np.bool_]:
-    """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+    """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
     way_m = np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
     # The pattern may be read from either end.
     R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
@@ -28,7 +28,7 @@ def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: floa
 
 
 class Placements:
-    """Poses of the board that were taken already, as each camera saw it.
+    """Poses of the captured boards, by camera.
 
     Args:
         min_move_m, min_turn_deg: a board that moved or turned as far stands somewhere new.
@@ -40,31 +40,31 @@ class Placements:
         self._poses: dict[str, Mapping[ImageKey, Array]] = {}
 
     def add(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
-        """Remember poses T_cam_board (4, 4) of a capture."""
+        """Add the poses T_cam_board (4, 4) of a capture."""
         self._poses[name] = poses
 
     def remove(self, name: str) -> None:
-        """Forget a capture: where it was made is new again."""
+        """Forget a capture, so that its placement counts as new."""
         self._poses.pop(name, None)
 
     def has_like(self, poses: Mapping[ImageKey, Array]) -> bool:
-        """Check whether every camera saw the board of one of the captures where it is now."""
+        """Check whether the poses, for every camera, are those of one of the captures."""
         return any(self.are_alike(held, poses) for held in self._poses.values())
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
-        """Check whether every camera that saw both boards saw them at one place; False where none did."""
+        """Check whether every camera that saw both boards saw them at one place; False if none did."""
         limits = self._min_move_m, self._min_turn_rad
         shared = one.keys() & two.keys()
         return bool(shared) and all(find_alike(one[key][None], two[key][None], *limits) for key in shared)
 
 
 def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:
-    """List where each camera, or without cameras each LiDAR, saw the board, for a capture's meta data."""
+    """List the board's pose by camera, or without cameras by LiDAR, for a capture's metadata."""
     return {"T_cam_board": {".".join(key): np.round(T, 9).tolist() for key, T in sorted(poses.items())}}
 
 
 def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
-    """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel); or each LiDAR.
+    """Find the board's pose by (camera, channel), T_cam_board (4, 4), or by LiDAR.
 
     Raises:
         SessionError: the capture is damaged, or of another rig.

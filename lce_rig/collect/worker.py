@@ -1,4 +1,4 @@
-"""An object in a process of its own, so that its work does not hold this process's interpreter.
+"""An object in a separate process, so that its work does not hold this process's interpreter.
 
 Threads that read sensors ask for the interpreter often and briefly; to search images for a board, or to
 calibrate, holds it for long.
@@ -24,7 +24,7 @@ _CLOSE_S = 2.0
 
 
 class Worker:
-    """An object of a picklable class in a process of its own; open while its `with` block lasts.
+    """An object of a picklable class in a separate process; open while its `with` block lasts.
 
     A process that ends, as when memory is short, is started again once for the call that noticed.
     """
@@ -52,7 +52,7 @@ class Worker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the process at once; a call that waits raises SourceError."""
-        # A call that waits in another thread forgets the process when it ends.
+        # A call waiting in another thread clears the process when it ends.
         self._is_closed, process = True, self._process
         if process is not None:
             process.terminate()
@@ -62,10 +62,10 @@ class Worker:
                 process.kill()
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call a method of the object, and give what it returns.
+        """Call a method of the object, and return its result.
 
         Raises:
-            LceRigError: as the method does; SourceError where its process ends again and again.
+            LceRigError: as the method does; SourceError if its process ends twice.
         """
         with self._lock:
             for _ in range(2):
@@ -107,7 +107,7 @@ class Worker:
 
 
 def _serve(connection: Connection) -> None:
-    """Answer calls until the other end is gone."""
+    """Answer calls until the connection is closed."""
     # The parent ends this; a closed terminal must not.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     subject: object = None

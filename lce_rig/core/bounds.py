@@ -1,7 +1,7 @@
 """Bounds on files of others: which are opened, and how many bytes of them are read, unpacked and decoded.
 
-A header may promise any size. What is read or unpacked at once is bounded by what one image, point cloud or
-chunk of messages can take; no reader has limits of its own.
+A header may promise any size. The data read or unpacked at once are bounded by the size of one image, point
+cloud or chunk of messages; readers have no limits of their own.
 """
 
 import io
@@ -38,7 +38,7 @@ def require_file(path: Path, most_bytes: int | None = None) -> None:
         most_bytes: largest size; None for files that are read piece by piece.
 
     Raises:
-        ValueError: what it is, or its size.
+        ValueError: the kind of file, or its size.
     """
     try:
         status = path.stat()
@@ -137,7 +137,7 @@ class Unpacking:
 def decoding() -> Iterator[None]:
     """Limit the memory that decoding one file may take; one file at a time.
 
-    Libraries take as much as a header promises, before they read what is there. Beyond the limit their
+    Libraries allocate as much as a header promises, before they read the data. Beyond the limit their
     allocations fail, which they report in ways of their own. Linux only; elsewhere without effect.
     """
     with _decoding:

@@ -45,11 +45,11 @@ class Intrinsics:
     def from_ros(
         cls, model: str, K: Array, distortion: tuple[float, ...], size_px: tuple[int, int]
     ) -> "Intrinsics":
-        """Take the fields of sensor_msgs/CameraInfo.
+        """Build intrinsics from the fields of sensor_msgs/CameraInfo.
 
         Args:
             model: plumb_bob, rational_polynomial, equidistant, or Kalibr's and OpenCV's names of these; ""
-                where nothing is distorted.
+                without distortion.
             K: (3, 3) or (9,).
             distortion: its coefficients; zeros at the end that the model lacks are dropped.
             size_px: (width, height).

@@ -72,7 +72,7 @@ class Scan:
     def corrected(self, range_offset_m: float) -> "Scan":
         """Subtract a constant from all ranges of a scan as recorded, along each ray from the origin.
 
-        A scan corrected by the same offset is returned unchanged, so that nothing is subtracted twice.
+        A scan corrected by the same offset is returned unchanged, so that it is not subtracted twice.
         Returns not beyond the offset are dropped.
 
         Args:
@@ -101,7 +101,7 @@ class EventColumns:
     Attributes:
         t_ns: (N,) int64 device time.
         x, y: (N,) uint16 px.
-        polarity: (N,) bool, True where it became brighter.
+        polarity: (N,) bool, True for brighter.
         host_ns: arrival of the first event at the host; None where unknown.
     """
 
@@ -128,7 +128,7 @@ class Events:
         t_ns: (N,) int64 device time, never decreasing; microsecond timestamps times 1000, kept exactly.
         x: (N,) uint16 column.
         y: (N,) uint16 row.
-        polarity: (N,) bool, True where it became brighter.
+        polarity: (N,) bool, True for brighter.
         width_px, height_px: resolution of the sensor.
         host_ns: arrival of the first event at the host; None if unknown.
     """
@@ -160,7 +160,7 @@ _Stretch = TypeVar("_Stretch", Events, EventColumns)
 
 
 def join_events(parts: Sequence[_Stretch]) -> _Stretch:
-    """Put stretches of one camera's stream together, at least one, in order of time."""
+    """Join ranges of one camera's stream, at least one, in order of time."""
     filled = [part for part in parts if len(part)] or parts[:1]
     if len(filled) == 1:
         return filled[0]
@@ -192,7 +192,7 @@ class Pulse:
 
 @dataclass(frozen=True, order=True)
 class Stream:
-    """What one sensor sends.
+    """One stream of a sensor.
 
     Attributes:
         sensor: the camera or LiDAR.

@@ -1,8 +1,8 @@
-"""What makers publish of their LiDARs: beams, timing, noise. The only place with such figures.
+"""Published figures of LiDARs: beams, timing, noise. The only place with such figures.
 
 The table is `data_sheets.json`, an object of `DataSheet`'s attributes for each model. The simulator, the
-guidance, a profile's defaults and `lce-rig rigs new` read it. Every entry names where its figures are
-published, and what in it is an estimate; docs/rig-profiles.md says which were compared with a document or a
+guidance, a profile's defaults and `lce-rig rigs new` read it. Every entry names its sources and its
+estimates; docs/rig-profiles.md lists which figures were compared with a document or a
 unit. Rings of a single unit differ from its model's by hundredths of a degree: `elevations_deg` in a profile
 replaces them.
 """
@@ -28,7 +28,7 @@ class DataSheet:
         source: where the figures are from.
         elevations_deg: of each laser, in firing order; empty without rings.
         sequence_ns: time between two firings of one laser; None where the maker fixes `columns` instead.
-        columns: firings of each laser per revolution, where they do not depend on the rate.
+        columns: firings of each laser per revolution, if they do not depend on the rate.
         firing_ns: time between two groups of lasers of one sequence.
         n_at_once: lasers that fire together.
         azimuths_deg: of each laser from the rotor's, towards growing azimuth (Velodyne and Hesai count the
@@ -41,17 +41,17 @@ class DataSheet:
         range_sigma_m: white noise of a range on a diffuse surface indoors.
         laser_bias_sigma_m: spread of the lasers' constant range errors about their mean.
         range_offset_sigma_m: standard deviation of that mean.
-        aperture_m: width of the beam where it leaves the sensor.
-        divergence_rad: full angle by which it widens, horizontal and vertical.
-        rim_m: by how much further than half of that width an edge still returns, at least; the VLP-16's is
-            from recorded boards, whose returns reach 9 to 10 mm beyond a border.
+        aperture_m: width of the beam at the sensor.
+        divergence_rad: full angle of the beam, horizontal and vertical.
+        rim_m: least distance beyond half of that width at which an edge still returns; the VLP-16's is from
+            recorded boards, whose returns reach 9 to 10 mm beyond a border.
         exit_m: size of the beam at its exit, horizontal and vertical, as the simulator spreads its energy.
         pattern: how its beams sweep the field of view: in "rings", as a "rosette", as the "mid360" does, or
             in any other way ("any").
         fov_deg: width of the field of view, and its lowest and highest elevation.
         points_hz: returns per second, of LiDARs without rings.
         aliases: other names.
-        estimated: attributes that no maker publishes: typical values, or those of a like model.
+        estimated: attributes that no maker publishes: typical values, or those of a similar model.
     """
 
     name: str
@@ -87,7 +87,7 @@ class DataSheet:
 
     @property
     def n_rings(self) -> int:
-        """How many lasers it has."""
+        """Number of lasers."""
         return len(self.elevations_deg)
 
     @property
@@ -102,7 +102,7 @@ class DataSheet:
         return np.asarray(np.radians(np.sort(self.elevations_deg)))
 
     def step_rad(self, rate_hz: float) -> float:
-        """Give the turn of the rotor between two firings of one laser."""
+        """Return the rotor's turn between two firings of one laser."""
         if not self.has_rings:
             return float(np.radians(_LINE_DEG))
         if self.sequence_ns is None:

@@ -1,4 +1,4 @@
-"""Errors that the user can repair; each states what happened, where, and an action."""
+"""Errors that the user can repair; each states the fault, its place and an action."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +16,8 @@ class LceRigError(Exception):
     """Base of every error the user can repair.
 
     Args:
-        what: what is wrong and where (file and key, sensor, capture), one line.
-        hint: what to do about it; empty if `what` says it already.
+        what: the fault and its place (file and key, sensor, capture), one line.
+        hint: the action; empty if the first line already states it.
     """
 
     exit_code = 1
@@ -74,7 +74,7 @@ class NotEnoughDataError(LceRigError):
     def of(finding: Finding) -> "NotEnoughDataError":
         """Make the error that names the missing data and their sensor."""
         subject, advice = f"{finding.subject}: " if finding.subject else "", finding.advice
-        # Several causes, a line each, are no sentence.
+        # Several causes, a line each, do not form a sentence.
         return NotEnoughDataError(
             subject + finding.text, advice if "\n" in advice else as_line(advice), finding
         )
@@ -106,8 +106,8 @@ def reading(
 
     Devices, pipes and files that are too large are refused before they are opened.
 
-    Libraries raise whatever their code meets in a damaged file: KeyError, struct.error, RuntimeError and
-    errors of their own. An LceRigError passes: it names its cause already. So do errors that only a bug in
+    Libraries raise errors of many kinds for a damaged file: KeyError, struct.error, RuntimeError and errors
+    of their own. An LceRigError passes: it names its cause already. So do errors that only a bug in
     lce-rig can raise.
 
     Args:
@@ -133,7 +133,7 @@ def reading(
 
 
 def _is_bug(error: Exception) -> bool:
-    """Check whether an error follows from the program, whatever a file holds."""
+    """Check whether an error comes from a bug in the program rather than from a file."""
     if isinstance(error, AttributeError):
         # Values of files have types of Python and NumPy.
         owner = error.obj if isinstance(error.obj, ModuleType | type) else type(error.obj)
@@ -179,8 +179,8 @@ def refusal_of(stage: Stage, error: LceRigError, otherwise: str = "collect this 
     """Refuse a capture for an error that was raised about it.
 
     Args:
-        stage: that raised it.
-        error: names what is wrong.
-        otherwise: the action against what cannot be read, where the error names none.
+        stage: of the error.
+        error: the cause.
+        otherwise: the action for unreadable data, if the error names none.
     """
     return _ERRORS[stage].refusal(what=error.what, hint=error.hint or (otherwise if stage == "read" else ""))

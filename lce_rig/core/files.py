@@ -1,4 +1,4 @@
-"""What files hold, as bytes and back: JSON, images, events (a NumPy archive)."""
+"""Encode and decode the contents of files: JSON, images, events (a NumPy archive)."""
 
 import io
 import zipfile
@@ -70,9 +70,9 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
 
 
 def encode_events(events: Events) -> bytes:
-    """Write events as a compressed archive; the same events give the same bytes.
+    """Encode events as a compressed archive; the same events give the same bytes.
 
-    Timestamps are stored as whole microseconds (t_us) where they are that, else as nanoseconds (t_ns).
+    Timestamps are stored in microseconds (t_us) if all are whole ones, else in nanoseconds (t_ns).
 
     Returns:
         The bytes of an .npz file, for its owner to put in place in one step.

@@ -38,7 +38,7 @@ class Kind:
         code: "family.name"; stable, listed in docs/findings.md.
         text: the fact, without an action: a template over subject and figures ({rms_m:mm}, {share:percent}),
             or a function of the finding, whose docstring is then the template shown in the docs. {session} is
-            the session's path where it is known, in commands.
+            the session's path, if known, in commands.
         action: the action, in the imperative; "" for none.
         severity: the usual one.
         actions: alternative actions, by the name that `Finding.action` gives.
@@ -184,7 +184,7 @@ class Refusal(Finding):
 
 
 def worst(findings: Iterable[Finding]) -> Severity:
-    """Return the highest severity; "note" where nothing was found."""
+    """Return the highest severity; "note" without findings."""
     return max((finding.severity for finding in findings), key=_ORDER.index, default="note")
 
 
@@ -223,12 +223,12 @@ class Losses:
             self._examples[kind] = finding
 
     def update(self, other: "Losses") -> None:
-        """Add what was counted elsewhere."""
+        """Add the counts of another."""
         for finding, n in other.counts():
             self.add(finding, n)
 
     def keep_more(self, other: "Losses") -> None:
-        """Take over the larger numbers of what a more complete pass over the same data found."""
+        """Take over larger counts from a more complete pass over the same data."""
         for kind, n in other._counts.items():
             if n >= self._counts[kind]:
                 self._counts[kind], self._examples[kind] = n, other._examples[kind]
@@ -245,7 +245,7 @@ class Losses:
         return dict(sorted(counts.items()))
 
     def n(self, *codes: str) -> int:
-        """Count what has one of these codes."""
+        """Count the losses with one of these codes."""
         return sum(n for (code, _, _), n in self._counts.items() if code in codes)
 
     def findings(self) -> list[Finding]:

@@ -97,17 +97,17 @@ def pose(R: Array, t: Array) -> Array:
 
 
 def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
-    """Build a pose from what a document holds: four lists of four numbers.
+    """Build a pose from a value in a document: four lists of four numbers.
 
     Args:
-        value: whatever was read.
-        rounding: how far its rotation may be off one for having been printed with few digits.
+        value: as read, of any type.
+        rounding: tolerance on the entries of its rotation, for numbers printed with few digits.
 
     Returns:
         (4, 4), its rotation made exact.
 
     Raises:
-        ValueError: it is none; in words that follow its name.
+        ValueError: it is not a pose; the text follows the value's name.
     """
     is_matrix = isinstance(value, list) and len(value) == 4
     if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in value):
@@ -161,19 +161,19 @@ def tangent_sizes(tangent: Array) -> tuple[float, float]:
 
 
 def sigma_sizes(cov: Array) -> tuple[float, float]:
-    """Take the roots of the summed variances, rotation in deg and translation in m, of a tangent.
+    """Return the roots of the summed variances, rotation in deg and translation in m, of a tangent.
 
     Args:
         cov: (6 + k, 6 + k), the tangent first.
     """
     rotation, translation = np.trace(cov[3:6, 3:6]), np.trace(cov[:3, :3])
-    # Rounding may leave variances of nothing below zero.
+    # Rounding may leave zero variances slightly negative.
     rotation, translation = max(rotation, 0.0), max(translation, 0.0)
     return float(np.degrees(np.sqrt(rotation))), float(np.sqrt(translation))
 
 
 def largest_sizes(cov: Array) -> tuple[float, float]:
-    """Compute what rotation (deg) and translation (m) of a tangent exceed with a probability of 5 % only.
+    """Return the rotation (deg) and translation (m) that a tangent exceeds with a probability of 5 %.
 
     The squared size, of mean tr C and variance 2 tr C^2, is taken as g chi2 with h degrees of freedom,
     g = tr C^2 / tr C, h = tr(C)^2 / tr C^2 (Satterthwaite).

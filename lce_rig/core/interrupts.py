@@ -15,16 +15,16 @@ from typing import Any
 
 EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted; what was written so far is whole"
-#: So long the program may take to end in good order; compiled code, and threads, may not notice at all.
+#: Grace period for a clean shutdown. Compiled code and threads may not see the interrupt.
 GRACE_S = 1.2
 # One key press can arrive twice, from the terminal and from a program that passes it on.
 _SAME_PRESS_S = 0.1
-# Leaves the alternate screen and shows the cursor, whichever of these a view has changed.
+# Sequence that leaves the alternate screen and shows the cursor, in case a view has changed them.
 _SCREEN_AS_BEFORE = b"\x1b[?1049l\x1b[?25h"
 
 
 class _InterruptWatch:
-    """Ends the process where Ctrl-C has not, after a grace or at the second press."""
+    """Ends the process if Ctrl-C has not, after a grace period or at the second press."""
 
     def __init__(self) -> None:
         self.grace_s = GRACE_S
@@ -42,7 +42,7 @@ class _InterruptWatch:
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         if self.is_raising:
-            self.is_raising = False  # A second one would reach what cleans up after the first.
+            self.is_raising = False  # A second one would interrupt the clean-up after the first.
             raise KeyboardInterrupt
 
     def _run(self) -> None:
@@ -60,7 +60,7 @@ class _InterruptWatch:
                     self.end()
 
     def end(self) -> None:
-        """Say so and end; threads, and whoever waits for them, are left behind."""
+        """Restore the terminal, print the message and exit at once, without joining threads."""
         with suppress(termios.error, OSError):
             if self._settings is not None:
                 termios.tcsetattr(sys.stdin, termios.TCSANOW, self._settings)
@@ -74,22 +74,22 @@ _watch: _InterruptWatch | None = None
 
 
 def watch_for_interrupts() -> None:
-    """Let Ctrl-C raise KeyboardInterrupt, and end the process where that takes too long.
+    """Let Ctrl-C raise KeyboardInterrupt, and end the process if that takes too long.
 
-    Call it once, from the main thread, before anything heavy is imported. Where Ctrl-C is ignored, as in
-    what a shell runs in the background, it stays so.
+    Call it once, from the main thread, before anything heavy is imported. If Ctrl-C is ignored, as for a
+    shell's background jobs, it stays ignored.
     """
     global _watch
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN and _watch is None:
         hook = sys.unraisablehook
 
         def leave_out_interrupts(unraisable: Any) -> None:
-            # They reached code that cannot raise them; the watch ends the program then.
+            # Interrupts in code that cannot raise them; the watch then ends the program.
             if not issubclass(unraisable.exc_type, KeyboardInterrupt):
                 hook(unraisable)
 
         sys.unraisablehook = leave_out_interrupts
-        # Python's last steps go without handlers, and Ctrl-C would hide how the program went.
+        # Python's last steps run without handlers, and Ctrl-C would hide the exit status.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         _watch = _InterruptWatch()
 
@@ -102,7 +102,7 @@ def interrupt_no_more() -> None:
 
 @contextmanager
 def patience(grace_s: float) -> Iterator[None]:
-    """Return the program longer to end in good order, while the block lasts."""
+    """Extend the grace period of a clean shutdown while the block lasts."""
     if _watch is None:
         yield
         return

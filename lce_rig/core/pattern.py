@@ -1,4 +1,4 @@
-"""The print on a board: which points are dark, and where its markers are."""
+"""The pattern of a board: its dark points, and the places of its markers."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +15,7 @@ DICTIONARIES = (
 )
 """OpenCV's dictionaries of markers, without DICT_."""
 LEAST_CORNERS = 8
-"""So many corners of a board with markers are needed in an image; fewer make a poor pose."""
+"""Least number of corners in an image of a board with markers; fewer make a poor pose."""
 # Kalibr's tags have a black border of two modules, other markers of one.
 _BORDER = {"charuco": 1, "aprilgrid": 2}
 # Tag 0 of AprilTag's family 36h11 as its authors draw it, from the upper left row by row. OpenCV's releases
@@ -48,7 +48,7 @@ def markers_of(board: Board, *, is_legacy: bool = False) -> Markers:
     Args:
         board: one that has markers.
         is_legacy: with the markers of a ChArUco board where OpenCV before 4.6 drew them: its upper left
-            square is white where it has an even number of rows.
+            square is white if it has an even number of rows.
     """
     s, (x0, y0) = board.square_m, board.pattern_offset_m
     if board.type == "charuco":

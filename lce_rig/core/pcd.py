@@ -53,7 +53,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
         several fields of one name is read.
 
     Raises:
-        ValueError: it is no PCD file, or damaged, or holds fewer points than its header promises.
+        ValueError: it is not a PCD file, or damaged, or holds fewer points than its header promises.
     """
     if not data:
         raise ValueError("it is empty")
@@ -159,7 +159,7 @@ def _read_ascii(body: bytes, header: _Header) -> NDArray[Any]:
 
 
 def _load_rows(body: bytes, dtype: np.dtype[Any], n_values: int, n_rows: int) -> NDArray[Any]:
-    """Load up to n rows of numbers; like PCL, without what a row has beyond its fields."""
+    """Load up to n rows of numbers; like PCL, ignoring values beyond a row's fields."""
     lines = (line for line in io.StringIO(body.decode("ascii", errors="replace")) if not line.isspace())
     ndmin: Literal[1, 2] = 1 if dtype.names else 2
     return np.asarray(np.loadtxt(lines, dtype, ndmin=ndmin, usecols=range(n_values), max_rows=n_rows))

@@ -6,7 +6,7 @@ import string
 from collections.abc import Mapping
 from typing import Any
 
-# Suffix of a format spec -> (factor, decimals where none are given, unit as printed).
+# Suffix of a format spec -> (factor, default number of decimals, unit as printed).
 _UNITS: Mapping[str, tuple[float, int, str]] = {
     "mm": (1000.0, 0, " mm"),
     "cm": (100.0, 0, " cm"),

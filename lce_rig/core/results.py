@@ -13,15 +13,15 @@ from lce_rig.core.geometry import Array, fit_plane, shortened
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """What an image shows of the pattern.
+    """Figures of the pattern in an image.
 
     Attributes:
         contrast: white minus black squares, grey values.
-        square_px: shortest side of a square; 0 where no two neighbours are visible.
+        square_px: shortest side of a square; 0 if no two neighbours are visible.
         edge_width_px: of the squares' edges, 10-90 %.
         sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
-        border_px: outermost corner to the border of the image.
-        n_corners: that could be fitted.
+        border_px: distance of the outermost corner from the border of the image.
+        n_corners: number of fitted corners.
     """
 
     contrast: float
@@ -34,14 +34,14 @@ class ImageQuality:
 
 @dataclass(frozen=True)
 class EventQuality:
-    """What events show of the board and of its motion; NaN if it could not be measured.
+    """Figures of the board and its motion in events; NaN if not measured.
 
     Attributes:
         events_px_s: events per second and pixel of the board, just before the image.
         events_px: events per pixel of the board in the time that the network remembers.
         speed_mps, turn_deg_s: of the board about the time of the image.
         speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
-        smear_m: how far the board moves while the LiDAR scans it.
+        smear_m: motion of the board while the LiDAR scans it.
     """
 
     events_px_s: float
@@ -55,14 +55,14 @@ class EventQuality:
 
 @dataclass(frozen=True)
 class LidarQuality:
-    """What a scan shows of the plate.
+    """Figures of the plate in a scan.
 
     Attributes:
         width_m, height_m: of the plate as measured.
         width_sigma_m, height_sigma_m: standard deviation of these.
         n_rings, n_points: on the plate.
         n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
-        n_ring_ends_dropped: that do not fit the outline.
+        n_ring_ends_dropped: those that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
@@ -95,7 +95,7 @@ class ImageBoard:
         T_cam_board: (4, 4), the pose with the smaller reprojection error.
         cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
         T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
-        chi2_gap: by how much the alternative's cost is higher, in units of the corner variance.
+        chi2_gap: excess of the alternative's cost, in units of the corner variance.
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -152,12 +152,12 @@ class LidarBoard:
         edge_ring: (M,) int16.
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
-        edge_behind_m: (M,) how far behind the board's plane the ring's next return beyond the edge lies;
-            inf if there is none. What stands close behind blends into the beam's return.
-        edge_echo: (M,) share 0..1 of the received power that comes from there where a beam meets it and the
-            board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
+        edge_behind_m: (M,) distance behind the board's plane of the ring's next return beyond the edge; inf
+            without one. An object close behind blends into the beam's return.
+        edge_echo: (M,) share 0..1 of the received power that comes from that object if a beam meets it and
+            the board alike; 0 without an object. A beam that meets both reports the stronger echo.
         edge_beam_m: (M, 2) of a board without rings: half the beam's width along the edge's normal, already
-            subtracted from the edge points, as the sum of what its width and its height add; None with rings.
+            subtracted from the edge points, as the sum of its width's and height's parts; None with rings.
         edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
             standard deviation; None where the whole border is sharp.
         azimuth_step_rad: angle between neighbouring firings of one ring.
@@ -283,7 +283,7 @@ class Observation:
 
     @classmethod
     def of(cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard]) -> "Observation":
-        """Pair a board in an image with the places of the scan where it may be, best first."""
+        """Pair a board in an image with its possible places in the scan, best first."""
         return cls(capture, image, places[0], tuple(places[1:]))
 
     @property

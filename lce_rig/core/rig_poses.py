@@ -15,8 +15,8 @@ _FEWEST_SENSORS = 3
 def find_rig_poses(pairs: Sequence[Calibration], lidars: Collection[str]) -> RigPoses | None:
     """Compose the pose of each sensor on the base sensor, along the fewest pairs.
 
-    Of equally many, the pairs of the better verdict are used. Failed pairs are left out. Errors of successive
-    pairs are taken as independent.
+    Among equally short chains, the pairs with the better verdict are used. Failed pairs are skipped. Errors
+    of successive pairs are treated as independent.
 
     Args:
         pairs: the results of a session.

@@ -69,7 +69,7 @@ READ = tuple(
 
 
 def product_of(model: str) -> Product | None:
-    """Find whose packets a model sends; None where they are not read."""
+    """Find the product whose packets a model sends; None if they are not supported."""
     sheet = find_data_sheet(model)
     return next((each for each in READ if sheet is not None and each.name == sheet.name), None)
 

@@ -1,4 +1,4 @@
-"""The attached sensors of a rig behind one protocol: a module a driver, imported when wanted."""
+"""The attached sensors of a rig behind one protocol: one module per driver, imported on use."""
 
 from importlib import import_module
 from typing import Any

@@ -25,7 +25,7 @@ from lce_rig.devices.reading import LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
-# A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
+# Capacity of the queue: batches of 10 ms from three streams for several seconds.
 _N_SLOTS = 2048
 _PAUSE_S, _SILENCE_S = 0.002, 5.0
 _MAX_CLOCK_ERROR_MS = 500.0
@@ -43,12 +43,12 @@ Value = bool | int | float | str
 
 
 class OpenedCamera(NamedTuple):
-    """A camera that is ready to be read.
+    """A camera that is ready to read.
 
     Attributes:
-        input: dv-processing's object; its getNext* are asked.
+        input: dv-processing's object, read by its getNext* methods.
         device: its model, serial number and firmware.
-        notes: what it does otherwise than asked.
+        notes: settings that differ from those requested.
         serial: its serial number.
     """
 
@@ -91,7 +91,7 @@ class DavisSource(LiveSource):
         """Open and set up the camera.
 
         Raises:
-            SourceError: it is absent, busy, another model, or cannot do what the profile wants.
+            SourceError: it is absent, busy, another model, or does not support the profile's settings.
         """
         self._opened = self._open_camera(self.sensor, self._settings)
         self._input: Any = self._opened.input
@@ -116,7 +116,7 @@ class DavisSource(LiveSource):
         """Report the state of the camera."""
         problems, clock = list(self._opened.notes), None
         if self._delays_ns:
-            # How old the freshest of the last events were on arrival.
+            # Least age of the latest events on arrival.
             delay_ms = min(self._delays_ns.copy()) * 1e-6
             clock = findings.DAVIS_CLOCK(delay_ms=delay_ms)
             if abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
@@ -132,7 +132,7 @@ class DavisSource(LiveSource):
         )
 
     def read(self) -> list[LiveSample]:
-        """Ask every stream once: between them there is no order of time."""
+        """Read every stream once; samples of different streams are not in time order."""
         host_ns = time.time_ns()
         samples: list[LiveSample] = []
         store = self._input.getNextEventBatch() if self._has["events"] else None
@@ -142,7 +142,7 @@ class DavisSource(LiveSource):
         if frame is not None:
             samples.append(self._to_image(frame, host_ns))
         for trigger in (self._input.getNextTriggerBatch() or ()) if self._has["pulses"] else ():
-            if trigger.type.name == _RISING:  # Others are of the camera's own making.
+            if trigger.type.name == _RISING:  # The camera generates others itself.
                 samples.append(Pulse(self.sensor, trigger.timestamp * NS_PER_US, self._n_pulses, host_ns))
                 self._n_pulses += 1
         if self._has["imu"]:
@@ -230,7 +230,7 @@ def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
 
 
 def _set_up(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Finding]:
-    """Set exposure, frame interval and biases as the profile says, and switch the trigger input on."""
+    """Apply the profile's exposure, frame interval and biases, and switch the trigger input on."""
     biases = {f"bias_{name.lower()}": bias for name, bias in camera.Davis346BiasCF.__members__.items()}
     durations = {
         "exposure_us": (camera.setExposureDuration, camera.getExposureDuration),

@@ -1,4 +1,4 @@
-"""A thread that writes what a live collection puts, so that nothing waits for a slow disk."""
+"""A thread that writes the data of a live collection, so that nothing waits for a slow disk."""
 
 import threading
 from collections.abc import Callable
@@ -11,24 +11,24 @@ from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 
-#: What may wait for the disk.
+#: Limit of the data waiting for the disk: beyond it, data are dropped.
 MOST_WAITING_BYTES = 512 * 2**20
 
 T = TypeVar("T")
 
 
 class DiskWriter(Generic[T]):
-    """Writes items to a session or a recording, in the order in which they come.
+    """Writes items to a session or a recording, in order of arrival.
 
-    Open while its `with` block lasts; what waits when it ends is written first. After a failure nothing more
-    is written.
+    Open while its `with` block lasts; items still waiting at its end are written first. After a failure it
+    writes nothing more.
 
     Attributes:
-        path: where.
+        path: of the session or recording.
         n_written: items written.
-        n_dropped: items that the disk was too slow for.
+        n_dropped: items dropped because the disk was too slow.
         n_waiting: items not written yet.
-        failure: why nothing more is written; None while it is.
+        failure: the error that stopped the writing; None without one.
     """
 
     def __init__(
@@ -41,10 +41,10 @@ class DiskWriter(Generic[T]):
         """Start the thread.
 
         Args:
-            path: where it writes, for messages.
+            path: of the session or recording, for messages.
             write: writes an item; called in the thread.
             finish: called in the thread after the last item.
-            most_waiting_bytes: what exceeds them is dropped.
+            most_waiting_bytes: limit of waiting data; items beyond it are dropped.
         """
         self.path = path
         self.n_written = self.n_dropped = self.n_waiting = 0
@@ -64,7 +64,7 @@ class DiskWriter(Generic[T]):
         self.close()
 
     def close(self) -> None:
-        """Write what waits, and finish; does nothing more the second time."""
+        """Write the waiting items, and finish; a second call has no effect."""
         with self._lock:
             if not self._is_closed:
                 self._is_closed = True
@@ -72,7 +72,7 @@ class DiskWriter(Generic[T]):
         self._thread.shutdown()
 
     def put(self, item: T, n_bytes: int = 0) -> None:
-        """Have an item written; never blocks. Where too much waits it is dropped."""
+        """Queue an item for writing; never blocks. Above the limit of waiting data it is dropped."""
         with self._lock:
             if self.failure is not None or self._is_closed:
                 return
@@ -104,7 +104,7 @@ class DiskWriter(Generic[T]):
             act()
         except LceRigError as error:
             self.failure = self.failure or error
-        except Exception as error:  # Nothing that goes wrong may end the thread.
+        except Exception as error:  # No error may end the thread.
             cause = getattr(error, "strerror", None) or repr(error)
             what, hint = f"{self.path} cannot be written: {cause}", "Free space there, or use another disk."
             self.failure = self.failure or SessionError(what, hint)

@@ -1,7 +1,7 @@
-"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and what its messages add up to.
+"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and the board's state from it.
 
-Bytes come in; pulses, clocks and problems come out: no device, no thread. Sentences are framed as NMEA 0183
-frames them: `$`, name and fields, `*`, and the exclusive or of what lies between.
+Bytes come in; pulses, clocks and problems come out, without a device or a thread. Sentences are framed as in
+NMEA 0183: `$`, name and fields, `*`, and the exclusive or of the bytes in between.
 """
 
 import math
@@ -69,7 +69,7 @@ class TimeReply(NamedTuple):
 
 
 class BoardStatus(NamedTuple):
-    """How the board does, once a second: bits, and how many lines the host did not read so far."""
+    """State of the board, once per second: flags, and the number of lines that the host has not read."""
 
     flags: int
     n_lost: int
@@ -117,7 +117,7 @@ def _number(field: bytes) -> int:
 
 
 def read_line(line: bytes) -> Message | None:
-    """Read one line, without its end; None where it is text or another sentence.
+    """Parse one line, without its end; None for text or another sentence.
 
     Raises:
         ValueError: the line is damaged.
@@ -158,9 +158,9 @@ class LineReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take bytes as they come, and give the messages that they complete."""
+        """Take received bytes, and return the messages that they complete."""
         *lines, rest = (self._rest + data).split(b"\n")
-        # Enough of a line without an end to tell that it is too long.
+        # This part of an unfinished line is enough to detect that it is too long.
         self._rest = rest[: MAX_LINE + 1]
         messages: list[Message] = []
         for line in lines:
@@ -175,9 +175,9 @@ class LineReader:
         return messages
 
 
-# An answer that takes longer came while the computer's clock was set.
+# Longest round trip: a longer one means that the computer's clock was set meanwhile.
 _MAX_ROUND_TRIP_NS = 2 * NS_PER_S
-# Messages are out of order by less; a board whose time goes back further has restarted.
+# Largest step back of the board's time between messages out of order; a larger one is a restart.
 _MOST_BACK_NS = NS_PER_S
 _STALLED_S = 3.0
 _DAMAGED = 0.01
@@ -199,19 +199,19 @@ class BoardState:
     Attributes:
         reader: reads the lines, and counts damaged ones.
         n_pulses: pulses handed on, by line.
-        n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
-        n_restarts: how often the board restarted.
-        restarted_ns: when it last did, by the steady clock; None where it did not.
-        heard_ns: when the last message came, or the port was opened, by the steady clock.
+        n_lost_by_line: pulses whose messages never came, by line, from gaps in the running numbers.
+        n_restarts: restarts of the board.
+        restarted_ns: time of the last restart, by the steady clock; None before one.
+        heard_ns: time of the last message, or of opening the port, by the steady clock.
         hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: of the last time request.
-        host_tracker, utc_tracker: of the computer's time of day and of UTC on the board's clock, by time
-            requests and by pulses per second; without a model before it is known.
+        host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from
+            time requests and pulses per second; without a model until there are enough of them.
     """
 
     def __init__(self, lines: Mapping[int, str]) -> None:
-        """Begin with a board that has said nothing yet.
+        """Begin with a board that has not sent a message yet.
 
         Args:
             lines: name of the camera on each channel; pulses on others are skipped.
@@ -234,7 +234,7 @@ class BoardState:
         self._asked: tuple[int, int] | None = None
 
     def opened(self, steady_ns: int) -> None:
-        """Note that the port was opened: a board that was unplugged knows nothing any more."""
+        """Note that the port was opened: an unplugged board has lost its state."""
         self.hello = None
         self._opened_ns = self.heard_ns = steady_ns
 
@@ -243,14 +243,14 @@ class BoardState:
         self._asked = (cookie, sent_ns)
 
     def feed(self, data: bytes, arrival: Arrival) -> list[Pulse]:
-        """Take bytes as they come, and give the pulses that they tell of."""
+        """Take received bytes, and return the pulses that they report."""
         messages = self.reader.feed(data)
         if messages:
             self.heard_ns = arrival.steady_ns
         return [pulse for message in messages for pulse in self.take(message, arrival)]
 
     def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
-        """Take a message, and give the pulses that it tells of."""
+        """Take a message, and return the pulses that it reports."""
         match message:
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
                 if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:
@@ -276,7 +276,7 @@ class BoardState:
             case TimeReply(cookie, rx_us, tx_us) if self._asked is not None and self._asked[0] == cookie:
                 sent_ns, self._asked = self._asked[1], None
                 self.round_trip_ns = arrival.host_ns - sent_ns - 1000 * (tx_us - rx_us)
-                # A clock that is set between question and answer spoils both.
+                # If the clock is set between request and reply, both readings are unusable.
                 if 0 <= self.round_trip_ns <= _MAX_ROUND_TRIP_NS:
                     middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
                     self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)

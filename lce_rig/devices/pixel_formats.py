@@ -15,12 +15,12 @@ Pixels = NDArray[np.uint8]
 
 
 class PixelFormat(NamedTuple):
-    """How an image lies in memory.
+    """Layout of an image in memory.
 
     Attributes:
         n_channels: values per pixel in a row; 0 for JPEG files.
-        bits: of a value; above 8 it lies in two bytes, little end first.
-        conversion: name of OpenCV's conversion to BGR; "" where none is needed.
+        bits: of a value; above 8 it takes two bytes, low byte first.
+        conversion: name of OpenCV's conversion to BGR; "" if not needed.
     """
 
     n_channels: int
@@ -61,7 +61,7 @@ FORMATS = {
     "MJPG": PixelFormat(0),
     "JPEG": PixelFormat(0),
 }
-"""By four-character code, padded with blanks as the kernel does."""
+"""Formats by four-character code, padded with blanks as in the kernel."""
 
 
 def find_format(name: str) -> str | None:
@@ -71,15 +71,15 @@ def find_format(name: str) -> str | None:
 
 
 class PixelDecoder:
-    """Makes images from the bytes of one stream.
+    """Decodes images from the bytes of one stream.
 
     Args:
         code: one of FORMATS.
         width, height: px.
-        stride: bytes from row to row; 0 where rows follow each other closely.
+        stride: bytes from row to row; 0 without padding.
 
     Attributes:
-        n_bytes: least number of bytes of a whole image; 1 where it is compressed.
+        n_bytes: least number of bytes of a whole image; 1 for compressed ones.
     """
 
     def __init__(self, code: str, width: int, height: int, stride: int = 0) -> None:

@@ -25,20 +25,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SourceStatus:
-    """How an attached sensor does.
+    """State of an attached sensor.
 
     Attributes:
         sensor: its name in the profile.
         n_samples: samples handed on since it was opened.
         n_dropped: samples dropped because they were not taken in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
-        rate_hz: samples a second over the last seconds; 0 before two have come.
-        clock: whose time the timestamps are, and how it is tied to others; None before the first.
-        problems: what is wrong now.
-        device: what answers: its model, serial number and firmware as far as it tells them.
-        serial: its serial number; "" where it tells none, or none yet.
-        rates_hz: what a device of several streams, or with a rotor, measures: by "scans", "frames", "events".
-        n_packets: data packets received; None of a sensor that sends none.
+        rate_hz: samples per second over the last seconds; 0 before the second sample.
+        clock: clock of the timestamps, and its relation to others; None before the first sample.
+        problems: present problems.
+        device: model, serial number and firmware of the attached device, as far as it reports them.
+        serial: its serial number; "" if it has not reported one.
+        rates_hz: rates measured by a device of several streams, or with a rotor: "scans", "frames", "events".
+        n_packets: data packets received; None for a sensor without packets.
         n_lost_by_line: of a sync board: pulses lost, by line.
     """
 
@@ -80,9 +80,9 @@ class Inbox(Generic[T]):
         """Hand items over; never blocks.
 
         Args:
-            sender: they come from.
+            sender: of the items.
             items: in order.
-            n_slots: so many of this sender may wait.
+            n_slots: most items of this sender that may wait; beyond, the oldest is dropped.
         """
         with self._changed:
             for item in items:
@@ -97,13 +97,13 @@ class Inbox(Generic[T]):
             self._changed.notify()
 
     def close(self) -> None:
-        """End the queue: items in it can still be taken, and nothing is waited for."""
+        """End the queue: its items can still be taken, without waiting for more."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> tuple[str, T] | None:
-        """Take the oldest item with its sender; None where nothing came in time, or the queue has ended."""
+        """Take the oldest item with its sender; None if none came in time, or the queue has ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
             if not self._items:
@@ -114,7 +114,7 @@ class Inbox(Generic[T]):
 
 
 class RateMeter:
-    """How many a second came over the last seconds; may be asked from any thread.
+    """Rate of arrivals over the last seconds; may be read from any thread.
 
     Args:
         now_s: the clock.
@@ -126,13 +126,13 @@ class RateMeter:
         self._lock = threading.Lock()
 
     def add(self, n: int) -> None:
-        """Count n that have just come."""
+        """Count n arrivals now."""
         with self._lock:
             self._came.append((self._now_s(), n))
 
     @property
     def rate_hz(self) -> float:
-        """How many a second; 0 before two have come, or where none has come for long."""
+        """Samples per second; 0 before the second sample, or after a long silence."""
         now_s = self._now_s()
         with self._lock:
             while self._came and self._came[0][0] < now_s - _RATE_WINDOW_S:
@@ -140,35 +140,35 @@ class RateMeter:
             if len(self._came) < 2:
                 return 0.0
             first_s, last_s = self._came[0][0], self._came[-1][0]
-            # Up to now where the next is overdue: what has just stopped must not look alive.
+            # If the next sample is overdue, count up to now: a stopped sensor must not look alive.
             typical_s = (last_s - first_s) / (len(self._came) - 1)
             n = sum(n for _, n in self._came) - self._came[0][1]
             return n / max(max(last_s, now_s - typical_s) - first_s, 1e-9)
 
 
 class LiveSource(ABC):
-    """An attached sensor, read by a thread of its own; see `AttachedSensors`.
+    """An attached sensor, read by its own thread; see `AttachedSensors`.
 
-    A driver opens, reads, closes and describes its device; the thread, silence, rates and opening again what
-    was lost are here, the same for all.
+    A driver opens, reads, closes and describes its device. This class provides the thread, detects silence,
+    measures rates and reopens lost devices.
 
     Attributes:
         sensor: its name in the profile.
-        lost: why the sensor is lost now, and since when by time.monotonic(); None while it is not.
-        opened_s: when it was opened first, by time.monotonic(); None before.
+        lost: error and time.monotonic() of the loss; None while the sensor is not lost.
+        opened_s: time.monotonic() of the first opening; None before.
     """
 
     def __init__(
         self, sensor: str, who: str, silence_s: float, what_to_check: str = "", n_slots: int = _N_SLOTS
     ) -> None:
-        """Prepare; nothing is opened yet.
+        """Prepare without opening the device.
 
         Args:
             sensor: its name in the profile.
-            who: the same for messages: "camera 'cam'".
-            silence_s: so long without a sample is an error.
+            who: name of the sensor for messages: "camera 'cam'".
+            silence_s: time without a sample that is an error.
             what_to_check: the hint of that error.
-            n_slots: samples that may wait to be taken; when more do, the oldest is dropped.
+            n_slots: most samples that may wait; beyond, the oldest is dropped.
         """
         self.sensor = sensor
         self.lost: tuple[SourceError, float] | None = None
@@ -183,7 +183,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Open the device; it sends, or will be heard, when this returns. Where it fails, `close` follows.
+        """Open the device, so that it sends or can be heard on return. After a failure, `close` is called.
 
         Raises:
             SourceError: it is absent, busy or of another model; the hint says what to check.
@@ -248,12 +248,12 @@ class LiveSource(ABC):
         )
 
     def note_heard(self) -> None:
-        """Call the device alive, though no sample is complete yet."""
+        """Note that the device is alive, though no sample is complete yet."""
         self._heard_s = time.monotonic()
 
     @property
     def is_stopping(self) -> bool:
-        """Whether to give up what waits for the device."""
+        """Whether waiting for the device must end."""
         return self._stopping.is_set()
 
     def _run(self, reopen_every_s: float | None) -> None:
@@ -287,7 +287,7 @@ class LiveSource(ABC):
                 self._inbox.put(self.sensor, came, self._n_slots)
                 self._rate.add(len(came))
                 heard_s, has_sent = now_s, True
-                # Back only now: a program that can be started may still find no camera.
+                # Reopened only with the first sample: a program that starts may still find no camera.
                 self.lost = None
             elif now_s - max(heard_s, self._heard_s) > self._silence_s:
                 return self.explain_silence(has_sent=has_sent)
@@ -297,8 +297,8 @@ class LiveSource(ABC):
 class AttachedSensors:
     """The attached sensors of a rig, read side by side into one queue; open while its `with` block lasts.
 
-    They are opened at the same time. A sensor that fails is closed and opened again and again; meanwhile the
-    others go on.
+    They are opened at the same time. A sensor that fails is closed and reopened repeatedly; meanwhile the
+    others continue.
 
     Attributes:
         sources: by the sensor's name.
@@ -345,7 +345,7 @@ class AttachedSensors:
         except BaseException:  # Ctrl-C while waiting, too.
             self.stop()
             raise
-        self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.
+        self._inbox.n_dropped.clear()  # Samples dropped while other sensors were being opened do not count.
         return self
 
     def __exit__(
@@ -356,7 +356,7 @@ class AttachedSensors:
         self._inbox.close()
 
     def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
-        """Take the next sample, with the sensor it comes from; None where none came in time."""
+        """Take the next sample, with its sensor; None if none came in time."""
         return self._inbox.take(timeout_s)
 
     def lost(self) -> dict[str, tuple[SourceError, float]]:
@@ -365,5 +365,5 @@ class AttachedSensors:
         return {name: why for name, why in lost.items() if why is not None}
 
     def statuses(self) -> dict[str, SourceStatus]:
-        """Ask every sensor how it does."""
+        """Return the state of every sensor."""
         return {name: source.status() for name, source in self.sources.items()}

@@ -1,4 +1,4 @@
-"""A sync board on a serial port: its trigger pulses as they come, and its clock tied to the computer's."""
+"""A sync board on a serial port: its trigger pulses, and its clock synchronised with the computer's."""
 
 import errno
 import math
@@ -102,7 +102,7 @@ class SyncBoard(LiveSource):
             )
 
     def close(self) -> None:
-        """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
+        """Close the port; the board's pulses continue, so that the LiDAR stays locked."""
         if self._port is not None:
             with suppress(serial.SerialException, OSError):
                 self._port.close()
@@ -163,10 +163,10 @@ class SyncBoard(LiveSource):
             return self._state.utc_tracker.model
 
     def start_triggers(self, rate_hz: float | None = None) -> None:
-        """Let the pulses of the cameras begin; running numbers go on.
+        """Start the pulses of the cameras; running numbers continue.
 
         Args:
-            rate_hz: of all lines in place of the profile's: slow pulses tell which image is of which.
+            rate_hz: of all lines instead of the profile's: slow pulses allow images to be matched to pulses.
         """
         with self._lock:
             self._rate_hz = rate_hz
@@ -211,7 +211,7 @@ class SyncBoard(LiveSource):
         return SourceError(f"{what} cannot be opened: {error}", "Check sync.device in the profile.")
 
     def _set_lines(self) -> None:
-        """Queue the commands that set the lines, for a board that knows nothing yet."""
+        """Queue the commands that set the lines of a board that has just started."""
         for trigger in self._settings.triggers.values():
             rate_hz = self._rate_hz or trigger.rate_hz
             line = f"{trigger.channel},{rate_hz:.6f},{trigger.phase_us},{trigger.pulse_us}"
@@ -238,7 +238,7 @@ class SyncBoard(LiveSource):
             self._state.asked(self._cookie, self._write(f"LCETM?,{self._cookie}"))
 
     def _tell_utc(self, now_ns: int) -> None:
-        """Tell a board that has no receiver when a second begins, by the computer's time of day."""
+        """Send UTC at the start of a second, by the computer's time of day, to a board without a receiver."""
         with self._lock:
             pps, model = self._state.pps, self._state.host_tracker.model
         if pps is None or pps[0].origin == "G" or model is None or model.n_used < _UTC_MIN_ANSWERS:

@@ -32,7 +32,7 @@ from lce_rig.devices.video_device import (
 )
 from lce_rig.rig import CameraSettings, DriverSettings, FrameTimingSettings
 
-# Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
+# Number of buffers: two drop images if the computer stalls for one, eight last for a quarter of a second.
 N_BUFFERS = 8
 _WAIT_S = 0.25
 _EXPOSURE_EVERY_S = 1.0
@@ -42,12 +42,12 @@ _SILENT_HINT = (
 
 
 Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
-# Their flags say end of frame; the timestamp is what the video input saw of the first row (devices' forums).
+# Jetson's drivers flag end of frame, but their timestamp is of the first row's arrival (devices' forums).
 _JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
 _MAX_DELAY_NS = 200_000_000
-# A computer that stalls takes images late from the queue: no reason to doubt a clock once it is known.
+# Largest delay once a clock is known: images come late from the queue after a computer stalls.
 _MAX_STALL_NS = 2_000_000_000
-# Two clocks that agree as well as this may stand for each other.
+# Clocks that agree within this are treated as one.
 _HARMLESS_NS = 2_000_000
 _N_BRACKETS = 3
 _CLOCK_IDS = {
@@ -117,14 +117,14 @@ def read_clocks() -> dict[str, int]:
 
 
 def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, int]:
-    """Choose the clock with 0 <= now - stamp <= 0.2 s; None where none fits.
+    """Choose the clock with 0 <= now - stamp <= 0.2 s; None if no clock fits.
 
     Args:
         stamp_ns: of an image.
         now_ns: readings of the candidates when it arrived.
 
     Returns:
-        The clock's name, and by how much the fitting clocks disagree, ns; 0 where one fits.
+        The clock's name, and the largest disagreement of the fitting clocks, ns; 0 for one.
     """
     delays = {name: now_ns[name] - stamp_ns for name in CLOCKS if name in now_ns}
     fitting = {name: delay_ns for name, delay_ns in delays.items() if 0 <= delay_ns <= _MAX_DELAY_NS}
@@ -134,17 +134,17 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, 
 
 
 class StampClock:
-    """Turns a driver's timestamps into UTC, by the clock they fit.
+    """Converts a driver's timestamps to UTC, by the clock that they fit.
 
-    The computer's UTC clock may be stepped while we run; its distance from the driver's clock is measured
+    The computer's UTC clock may be stepped during a run, so its offset from the driver's clock is measured
     again for every image.
 
     Args:
         clock: name of the driver's clock; "auto" tries the candidates on the timestamps.
 
     Attributes:
-        used: name of the clock behind the last timestamp; None where it fitted none.
-        delay_ns: how old the last image was by that clock.
+        used: name of the clock of the last timestamp; None if it fitted no clock.
+        delay_ns: age of the last image on arrival, by that clock.
     """
 
     def __init__(self, clock: str = "auto") -> None:
@@ -155,7 +155,7 @@ class StampClock:
         self._spread_ns = 0
 
     def to_utc_ns(self, stamp_ns: int) -> int | None:
-        """Convert the timestamp of an image that has just arrived; None where no clock fits."""
+        """Convert the timestamp of an image that has just arrived; None if no clock fits."""
         # Between two readings of UTC; the closest of a few tries, without interruption.
         brackets = []
         for _ in range(_N_BRACKETS):
@@ -188,13 +188,13 @@ class StampClock:
 class V4l2Source(LiveSource):
     """A camera at /dev/video*; see `LiveSource`.
 
-    Timestamps are mid exposure in the computer's UTC: the driver's, moved by (1) to (4)
-    and read by the clock that they fit. Where none fits it is the arrival, and the status says so.
+    Timestamps are mid exposure in the computer's UTC: the driver's, corrected by (1) to (4) and read by the
+    clock that they fit. Without such a clock they are times of arrival, and the status reports it.
 
     Args:
         sensor: the camera's name in the profile.
         settings: its block of the profile.
-        silence_s: so long without an image is an error.
+        silence_s: time without an image that is an error.
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
@@ -216,7 +216,7 @@ class V4l2Source(LiveSource):
         """Open, set up and start the camera.
 
         Raises:
-            SourceError: it is absent, busy, or cannot do what the profile wants.
+            SourceError: it is absent, busy, or does not support the profile's settings.
         """
         driver = self._settings.driver
         if driver.device is None:
@@ -267,7 +267,7 @@ class V4l2Source(LiveSource):
         )
 
     def _set_up_images(self) -> PixelDecoder:
-        """Agree on the form of the images.
+        """Negotiate the format of the images.
 
         Raises:
             SourceError: another size than the intrinsics', or no pixel format that is read here.
@@ -330,7 +330,7 @@ class V4l2Source(LiveSource):
         return [Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)]
 
     def _read_exposure(self) -> None:
-        """Ask for the exposure, which automatics may change at any time."""
+        """Read the exposure, which automatic modes may change at any time."""
         self._exposure_read_s = time.monotonic()
         wanted_us = self._settings.driver.frame_timing.exposure_us
         self._exposure_us = read_exposure_us(self._device, self._known) if wanted_us is None else wanted_us

@@ -1,4 +1,4 @@
-"""The kernel's video interface, as 64-bit Linux lays it out; only what reading a camera takes.
+"""V4L2 structures and ioctl numbers of 64-bit Linux, limited to capture.
 
 References:
     https://docs.kernel.org/userspace-api/media/v4l/v4l2.html, linux/videodev2.h

@@ -58,15 +58,15 @@ class VideoDevice:
             raise
 
     def ioctl(self, code: int, what: Structure | c_int32) -> None:
-        """Ask the kernel; the answer stands in `what`.
+        """Call the kernel, which writes its answer to the structure.
 
         Raises:
-            OSError: as the kernel says.
+            OSError: from the kernel.
         """
         ioctl(self._fd, code, what, True)
 
     def grants(self, code: int, what: Structure | c_int32) -> bool:
-        """Ask the kernel for something that it may refuse; says whether it did not."""
+        """Make a request that the kernel may refuse; return whether it succeeded."""
         try:
             self.ioctl(code, what)
         except OSError:
@@ -74,7 +74,7 @@ class VideoDevice:
         return True
 
     def close(self) -> None:
-        """Stop, give the buffers back and close."""
+        """Stop, release the buffers and close."""
         if self._fd >= 0:
             self.stop()
             os.close(self._fd)
@@ -90,7 +90,7 @@ class VideoDevice:
         return codes
 
     def set_layout(self, code: str, width: int, height: int) -> tuple[tuple[str, int, int], int]:
-        """Ask for a form of images.
+        """Request a pixel format and size of images.
 
         Returns:
             The pixel format and size, px, that will be delivered, and the bytes from row to row.
@@ -110,7 +110,7 @@ class VideoDevice:
         return (granted, pix.width, pix.height), pix.bytesperline
 
     def set_rate(self, rate_hz: float) -> None:
-        """Ask for images a second; the device may choose another rate."""
+        """Request a rate of images, Hz; the device may choose another."""
         ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
         self.grants(abi.SET_PARAMETERS, ask)
 
@@ -135,8 +135,8 @@ class VideoDevice:
             raise self._explain(error, "does not start") from None
 
     def stop(self) -> None:
-        """Stop and give the buffers back; never raises."""
-        # A device that was pulled out answers nothing any more.
+        """Stop and release the buffers; never raises."""
+        # An unplugged device does not answer.
         self.grants(abi.STREAM_OFF, c_int32(abi.VIDEO_CAPTURE))
         while self._buffers:
             self._buffers.pop().close()
@@ -144,11 +144,11 @@ class VideoDevice:
         self.grants(abi.REQUEST_BUFFERS, request)
 
     def read(self, timeout_s: float) -> tuple[bytes, Any] | None:
-        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None where none came in time.
+        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None if none came in time.
 
         Raises:
             SourceError: the device is gone.
-            OSError: it failed this once (EIO).
+            OSError: this one image failed (EIO).
         """
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
@@ -219,7 +219,7 @@ def video_devices() -> list[str]:
 
 
 def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
-    """Return the serial number of the USB device behind a video device; "" where the kernel knows none.
+    """Return the serial number of the USB device behind a video device; "" if the kernel knows none.
 
     Args:
         name: of the video device: "video0".
@@ -258,13 +258,13 @@ def list_controls(device: VideoDevice) -> dict[str, Control]:
 
 
 def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]) -> list[Finding]:
-    """Set what the profile wants: choices first, since automatic modes lock other settings.
+    """Apply the profile's controls: choices first, since automatic modes lock other settings.
 
     Returns:
-        What the device set otherwise than asked: it keeps numbers within its range.
+        Deviations from the requested values: the device clips numbers to its range.
 
     Raises:
-        SourceError: it has no such setting, or cannot take the value.
+        SourceError: the device lacks the setting, or cannot take the value.
     """
     known = list_controls(device)
     where = f"camera {sensor!r}: driver.controls"
@@ -290,7 +290,7 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
 
 
 def read_control(device: VideoDevice, setting: Control) -> int | None:
-    """Read one setting; None where the device does not say."""
+    """Read one setting; None if the device does not report it."""
     number, kind = setting
     control = abi.V4l2Control(id=number)
     if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):
@@ -299,7 +299,7 @@ def read_control(device: VideoDevice, setting: Control) -> int | None:
 
 
 def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float | None:
-    """Read how long a row is exposed; None where no setting says so in a known unit.
+    """Read the exposure time of a row, us; None without a setting in a known unit.
 
     V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
     """

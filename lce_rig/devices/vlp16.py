@@ -23,7 +23,7 @@ from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
-# A computer that is busy elsewhere for longer than this is too slow anyhow.
+# Least duration of packets that the buffer must hold: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
@@ -32,9 +32,9 @@ _GATHER_S = 0.005
 
 # Two seconds of data packets, as the kernel accounts for them.
 _WANTED_BUFFER_BYTES = 4 << 20
-# What a data packet takes of the buffer: its bytes, and the kernel's own about it.
+# Buffer space per data packet: its bytes, and the kernel's overhead.
 _PACKET_COST_BYTES = 2304
-# Datagrams that are taken before other threads may run: 85 ms of data packets.
+# Datagrams read before other threads may run: 85 ms of data packets.
 _MOST_AT_ONCE = 64
 # asm-generic/socket.h; Python names neither.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
@@ -46,13 +46,13 @@ _TIMESPEC = struct.Struct("@ll")
 class Vlp16Source(LiveSource):
     """The scans of an attached VLP-16; open while its `with` block lasts.
 
-    `driver.address` is whose packets are taken, those of the VLP-16 heard first where it is not set;
-    `driver.port` is the port of data packets (2368); `driver.controls` as `read_controls` reads them.
+    `driver.address` is the LiDAR's address, by default that of the VLP-16 heard first; `driver.port` is the
+    port of data packets (2368); `driver.controls` as `read_controls` reads them.
 
     Args:
         sensor: its name in the profile.
         settings: its block of the profile.
-        silence_s: without packets for so long, it is taken to be gone.
+        silence_s: time without packets after which it counts as lost.
     """
 
     def __init__(self, sensor: str, settings: LidarSettings, silence_s: float = SILENCE_S) -> None:
@@ -90,7 +90,7 @@ class Vlp16Source(LiveSource):
                 raise self.explain_silence(has_sent=False)
 
     def read(self) -> list[Scan]:
-        """Take the packets that came, and give the scans that they complete.
+        """Read the packets received, and return the scans that they complete.
 
         Raises:
             SourceError: the network failed.
@@ -109,7 +109,8 @@ class Vlp16Source(LiveSource):
             raise SourceError(what, "Check the cable.") from None
         if self._stream.n_data > n_before:
             self.note_heard()
-            # The kernel has stamped what comes meanwhile: several packets cost hardly more than one.
+            # Packets that arrive during the pause already have the kernel's timestamps: reading several at
+            # once costs hardly more than one.
             time.sleep(_GATHER_S)
         return scans
 
@@ -177,7 +178,7 @@ class Vlp16Source(LiveSource):
             return scan
 
     def _find_losses(self, stream: Vlp16Stream, ports: "tuple[UdpPort, ...]") -> list[Finding]:
-        """Find what keeps packets from coming, from being taken or read, and a rotor of another speed."""
+        """Find losses on the network, in the buffer and in decoding, and a rotor at another rate."""
         problems: list[Finding] = []
         n_overflowed = sum(port.n_overflowed for port in ports)
         granted_bytes = min((port.granted_bytes for port in ports), default=0)
@@ -212,10 +213,10 @@ class UdpPort:
 
         Args:
             port: its number.
-            what: it is for, for messages: "lidar: data packets".
+            what: its use, for messages: "lidar: data packets".
 
         Raises:
-            SourceError: another program holds it alone, or it may not be opened.
+            SourceError: another program has exclusive use of it, or permission is missing.
         """
         self.port = port
         self.n_overflowed = 0
@@ -237,7 +238,7 @@ class UdpPort:
             is_low = port < 1024
             hint = "Ports below 1024 need root; set driver.port as on the LiDAR's web page." if is_low else ""
             raise SourceError(f"{what}: UDP port {port} cannot be opened: {error.strerror}", hint) from None
-        # Linux doubles what was asked for, for its own accounts, and reports the double.
+        # Linux doubles the requested size for its own overhead, and reports the double.
         self.granted_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     def fileno(self) -> int:

@@ -1,1 +1,1 @@
-"""Whether a computer and its sensors are fit to collect: a function a check, which yields its findings."""
+"""Checks of whether a computer and its sensors are ready to collect: one function each, yielding findings."""

@@ -1,8 +1,8 @@
-"""Is this computer, with these sensors, fit to collect? Every check, and the table of them.
+"""Checks of whether this computer, with these sensors, is ready to collect.
 
-A check yields findings, first how it is as a note, then what is wrong. A check of the computer takes the
-examination, all others the name of a sensor with it. A fault is a warning where collecting works, less well,
-and an error where it does not or its data are wrong.
+A check yields findings: first its notes, then the faults. A check of the computer takes the examination, all
+others also the name of a sensor. A fault is a warning if collecting works, but less well. It is an error if
+collecting fails or its data are wrong.
 """
 
 import ctypes
@@ -43,12 +43,12 @@ _MAX_LOST_SHARE = 0.01
 _STOPPED_S = 1.0
 _US_PER_S = 1e6
 _SIGMA_PER_MAD = 1.4826
-# Frames and lines come in bursts: how many are still on their way differs.
+# Tolerance on the counts of frames and pulses, absolute and relative: both arrive in bursts.
 _ROOM, _MAX_UNLIKE = 2, 0.01
 
 
 def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Measure the free space of a folder's disk, and how fast it takes data that are flushed to it."""
+    """Measure the free space of a folder's disk, and its rate of writing flushed data."""
     folder = exam.folder.absolute()
     folder = next(path for path in (folder, *folder.parents) if path.exists())
     try:
@@ -74,7 +74,7 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 
 def check_computer_clock(_exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Ask the kernel whether something keeps the computer's clock right; a VLP-16's hour is taken from it."""
+    """Ask the kernel whether the computer's clock is synchronised; a VLP-16's hour is taken from it."""
     timex = (ctypes.c_long * _TIMEX_LONGS)()
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state in (-1, _TIME_ERROR):
@@ -98,7 +98,7 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Compare a LiDAR's or camera's rates with the profile, and count what was lost."""
+    """Compare a LiDAR's or camera's rates with the profile, and count its losses."""
     seen, rig = exam.seen[sensor], exam.rig
     status = seen.status
     if status is None:
@@ -134,7 +134,7 @@ def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
-    """Return how many scans or images a second the profile wants; None where it does not say."""
+    """Return the profile's rate of scans or images, Hz; None if it states none."""
     if sensor in rig.lidars:
         return rig.lidars[sensor].rate_hz
     settings = rig.cameras[sensor].driver
@@ -148,7 +148,7 @@ def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
 
 
 def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
-    """Judge how many scans or images a second came.
+    """Judge the rate of scans or images.
 
     A LiDAR's rate is its rotor's speed, by its own clock: scans arrive late on a busy computer.
     """
@@ -227,7 +227,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
     pulses = [pulse for pulse in board.pulses if pulse.sensor == sensor]
     n_frames, n_pulses = len(seen.frames), len(pulses)
     if seen.frames and pulses:
-        # While both came; by their running numbers, so that lost ones count.
+        # Count over the common interval, by sequence number, so that losses are included.
         frames_ns = [image.host_ns or 0 for image in seen.frames]
         first_ns = max(frames_ns[0], pulses[0].host_ns)
         last_ns = min(frames_ns[-1], pulses[-1].host_ns)
@@ -237,7 +237,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
         yield findings.UNEQUAL()
     trigger, clock = sync.triggers[sensor], board.host_clock
     if clock is None or trigger.rate_hz * trigger.max_delay_s >= 1:
-        return  # `collect` begins with slow pulses then, to tell which is which.
+        return  # `collect` then starts with slow pulses, to match images to them.
     matcher, delays_ms = TriggerMatcher(sensor, round(1e9 * trigger.max_delay_s)), list[float]()
     matcher.set_clock(clock.inverse())
     samples: list[Pulse | Image] = sorted([*pulses, *seen.frames], key=lambda sample: sample.host_ns or 0)
@@ -260,7 +260,7 @@ def _count(samples: Sequence[Pulse | Image], first_ns: int, last_ns: int) -> int
 
 
 def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Fit the clock of a camera that sees the board's pulses to them."""
+    """Fit the clock of a camera that sees the board's pulses to these pulses."""
     board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = exam.driver(sensor) == "davis"
     if not is_davis or seen.status is None or board is None or board.status is None:
@@ -299,7 +299,7 @@ def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 
 def tie(exam: Examination) -> RigClock:
-    """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
+    """Convert every possible sensor to the rig's clock, as `collect` does with the same samples."""
     board = exam.seen.get(BOARD)
     has_board = board is not None and board.status is not None
     cameras = [name for name in exam.rig.cameras if exam.driver(name) == "davis"]
@@ -337,16 +337,16 @@ CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = 
     },
     "rig": {"sync": check_sync},
 }
-"""Every check by its line's name; a line without findings is left out."""
+"""Every check by its line's name; a line without findings is skipped."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line: one thing looked at.
+    """Result of one check, a line of the report.
 
     Attributes:
-        subject: "computer", a sensor's name in the profile, or "rig" for what concerns several.
-        name: what was looked at, in a word.
+        subject: "computer", a sensor's name in the profile, or "rig" for several sensors together.
+        name: the item checked, in a word.
         findings: of the check; those without a subject get the line's.
     """
 
@@ -370,18 +370,18 @@ class Check:
 
 
 def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Check]:
-    """Look at the computer and every sensor of a rig.
+    """Examine the computer and every sensor of a rig.
 
-    What is absent or fails is an error; everything else is looked at all the same. Takes the duration, and
-    what the sensors take to open.
+    An absent or failing sensor is an error, and everything else is still examined. Takes the duration, and
+    the time that the sensors take to open.
 
     Args:
         rig: the profile.
-        duration_s: for how long the sensors are watched.
-        folder: where sessions are to be written.
+        duration_s: time for which the sensors are watched.
+        folder: of the sessions.
 
     Returns:
-        A line for each thing looked at: the computer's, each sensor's, the rig's.
+        A line for each check: of the computer, of each sensor, of the rig.
     """
     seen, sources = dict[str, ObservedSensor](), list[LiveSource]()
     for sensor in sensors(rig):

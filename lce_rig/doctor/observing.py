@@ -1,4 +1,4 @@
-"""All sensors of a rig watched side by side for some seconds; one that is absent keeps no other from it."""
+"""Watch all sensors of a rig at the same time for some seconds; an absent one does not stop the others."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
-# A sync board that its port's opening resets takes some seconds to speak.
+# Longest time for sensors to open: a sync board that is reset by it takes some seconds to answer.
 _OPENING_S = 10.0
 _CLOSING_S = 3.0
 _POLL_S = 0.05
@@ -29,14 +29,14 @@ class ObservedSensor:
 
     Attributes:
         sensor: its name in the profile.
-        status: the last that its driver said; None where it did not open, or ended before anything came.
-        failure: why it could not be opened, or ended early.
-        watched_s: for how long it was open.
-        ended_ns: when that ended, by the computer's time of day.
+        status: last status of its driver; None if it did not open, or ended before its first sample.
+        failure: the error if it could not be opened, or ended early.
+        watched_s: time for which it was open.
+        ended_ns: end of that time, by the computer's time of day.
         arrivals_ns: of each scan, image or batch that has a timestamp, by "scans", "frames", "events".
         frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
-        n_events: how many events came in all.
+        n_events: number of events.
         host_clock, utc_clock: a sync board's models of the computer's time and of UTC.
     """
 
@@ -82,8 +82,8 @@ class Examination:
 
     Attributes:
         rig: the profile.
-        folder: where sessions are to be written.
-        seen: what was observed, by the sensor's name.
+        folder: of the sessions.
+        seen: observations, by the sensor's name.
     """
 
     rig: Rig
@@ -96,7 +96,7 @@ class Examination:
         return [] if status is None else [each for each in status.problems if each.family in families]
 
     def driver(self, sensor: str) -> str:
-        """Name the driver that reads a sensor; "" where there is none."""
+        """Name the driver that reads a sensor; "" without one."""
         try:
             return driver_of(self.rig, sensor)
         except SourceError:
@@ -106,7 +106,7 @@ class Examination:
 def observe(sources: Sequence[LiveSource], duration_s: float) -> dict[str, ObservedSensor]:
     """Open every sensor and watch it, for a time that begins when the last one has opened or failed.
 
-    Where none is open, nothing is waited for.
+    If all sensors are lost, it returns early.
 
     Args:
         sources: of the sensors.

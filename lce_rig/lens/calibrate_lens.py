@@ -63,8 +63,8 @@ def estimate_intrinsics(
     """Fit intrinsics and board shape to the corners of all views, each with its own pose and noise level.
 
     Boards are weighted by their own residuals, so that blurred images and noisier channels count less, and
-    views that do not fit the others are refused by name. Corners of one image err together: all weights
-    are divided by the ratio of the captures' scatter to what independent corners explain, before the
+    views that do not fit the others are refused by name. Errors of corners in one image are correlated: all
+    weights are divided by the ratio of the captures' scatter to that of independent corners, before the
     prior counts.
 
     Args:
@@ -157,7 +157,7 @@ def _variances(setup: Setup, state: LensState) -> Array:
 
 
 def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
-    """Return each board the median of its channel (K,)."""
+    """Return for each board the median of its channel (K,)."""
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 

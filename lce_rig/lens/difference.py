@@ -1,8 +1,8 @@
 """Pixel difference of two lens models after the rotation of the camera that minimises it.
 
 A shift of the principal point is nearly a small rotation of the camera. Two intrinsics may therefore differ
-in their numbers and still project alike. What counts is the pixel displacement after the best rotation, and
-that rotation.
+in their numbers and still project alike. The relevant figures are the pixel displacement after the best
+rotation, and that rotation.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _LEAST_ALIGNED = 10
 
 
 class LensDifference(NamedTuple):
-    """How far apart a second lens model projects the rays of a first one's pixels where boards were seen.
+    """Distance between the pixels of two lens models for the same rays, at places with boards.
 
     Attributes:
         rms_px: rms distance; infinite if the first model projects none of the pixels.
@@ -102,7 +102,7 @@ def compare_lenses(
 def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> Array:
     """Propagate the covariance of intrinsics to the errors that a profile states.
 
-    Parameters are correlated: the errors share what their covariance lets pixels move where boards were seen.
+    Parameters are correlated: the errors are fitted to the pixel displacements at places with boards.
 
     Args:
         fitted: the intrinsics.

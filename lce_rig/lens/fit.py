@@ -34,7 +34,7 @@ _EXACT_M = 1e-7
 # corners' own offsets.
 N_MODES = 15
 _MAX_STEPS = 40
-# Below this share of what is known of a direction of the lens, boards tell nothing of it.
+# Share of the prior's variance that boards must remove from a direction of the lens to be compared in it.
 _TOLD = 0.1
 
 
@@ -71,7 +71,7 @@ class Setup:
             corners_px: as measured.
             board: the board.
             model: of the lens.
-            prior: of lens and board; None where nothing is known of the lens.
+            prior: of lens and board; None without one of the lens.
 
         References:
             D. Kogan, mrcal: the deformed calibration object.
@@ -109,13 +109,13 @@ class Setup:
         return float(off @ self.information[: len(lens), : len(lens)] @ off)
 
     def contradicted(self, lens: Array, cov: Array, chance: float) -> list[tuple[slice, float]]:
-        """Compare the boards with the prior of focal lengths, principal point and distortion, each alone.
+        """Compare the boards with the prior of focal lengths, principal point and distortion separately.
 
         A fitted lens (P,) is the compromise of boards and prior. Its distance d from the prior's has the
         covariance C_0 - C, with the prior's C_0 and the fitted lens's C: d^T (C_0 - C)^-1 d is chi-squared if
-        both are right. In units of C_0, the eigenvalues w of C_0 - C are the boards' shares of what is known;
-        directions of small shares are left to the prior. The boards' own distance is d / w, of which
-        (1 - w) / w is the variance of their errors.
+        both are right. In units of C_0, the eigenvalues w of C_0 - C are the boards' shares of the
+        information; directions of small shares are left to the prior. The boards' own distance is d / w, of
+        which (1 - w) / w is the variance of their errors.
 
         Args:
             lens: the fitted one.

@@ -120,7 +120,7 @@ class IntrinsicsEstimate:
 
 
 def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> tuple[str, ...]:
-    """List what the captures do not determine, with figures and actions, the most severe first.
+    """List the weaknesses of the captures, with figures and actions, the most severe first.
 
     Args:
         estimate: of the lens.

@@ -12,7 +12,8 @@ from lce_rig.rig import BoardSettings, CameraSettings
 # Models are compared on the rays of a grid of this many points across the image.
 _GRID = 24
 _STEPS = 20
-# So far beyond the outermost ray, and by so much there, a converted model still draws rays farther out.
+# Angle beyond the outermost ray, and the least growth of the radius over it, of a converted model: it then
+# still projects rays farther out.
 _RIM_RAD, _RISE_PX = 2e-3, 1e-3
 _HOLDS = 1e4
 
@@ -146,14 +147,14 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     return vector
 
 
-# Where a profile states no standard deviation of its intrinsics, in focal lengths; the last is of a pixel in
-# the image's corner. Chosen on some rigs' recordings, they repeat best on the other rigs', too.
+# Default standard deviations of a profile's intrinsics, in focal lengths; the last is of a pixel in the
+# image's corner. Chosen for the best repeatability on some rigs' recordings, they are best on others, too.
 _FOCAL, _PRINCIPAL_POINT, _DISTORTION = 2.5e-3, 4e-3, 2.5e-3
-# Of the ratio of both focal lengths.
+# Standard deviation of the ratio of both focal lengths.
 _ASPECT = 5e-4
-# The mean square over the image of a displacement that grows with the third power, by that in the corner.
+# Ratio of the rms over the image to the value in its corner, of a cubic displacement.
 _OF_CORNER = 0.4
-# Decentring displaces a pixel in the corner by this fraction of the whole distortion. Boards hardly tell it
+# Share of the whole distortion by which decentring displaces a pixel in the corner. Boards hardly separate it
 # from a shift of the principal point; its coefficients p1, p2 are the tangential ones of the radtan models.
 _DECENTRING = 0.4
 # Intrinsics that a profile states to be exact.
@@ -180,7 +181,7 @@ class LensPrior:
 
     @classmethod
     def read(cls, camera: CameraSettings, board: BoardSettings) -> "LensPrior":
-        """Read a profile's camera and board; defaults take the place of what it leaves out."""
+        """Read a profile's camera and board; defaults replace missing values."""
         stated, focal_px = camera.intrinsics, camera.intrinsics.fx_px
 
         def sigma_px(value: float | None, usual: float) -> float:
@@ -203,13 +204,13 @@ class LensPrior:
 
     @property
     def decentring_px(self) -> float:
-        """Standard deviation of what p1 and p2 each displace a pixel in the image's corner by."""
+        """Standard deviation of the displacement of a pixel in the image's corner by p1 and by p2, each."""
         return _DECENTRING * self.distortion_px
 
     def of(self, model: LensModel) -> tuple[Array, Array]:
-        """Give mean (P,) and information (P, P) of a model's parameters.
+        """Return mean (P,) and information (P, P) of a model's parameters.
 
-        Distortion has the same standard deviation over the image whatever its shape: with D the derivative of
+        Distortion of any shape has the same standard deviation over the image: with D the derivative of
         the n pixels of a grid by the coefficients, its information is D^T D / (n sigma^2). Decentring, which
         displaces by 3 p r^2 focal lengths at radius r, is smaller.
         """

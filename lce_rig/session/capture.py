@@ -37,7 +37,7 @@ class _Record(BaseModel):
 
 
 class Entry(_Record):
-    """The file of an image, a scan or a range of events; what other kinds have is empty."""
+    """The file of an image, a scan or a range of events; fields of other kinds are empty."""
 
     kind: Literal["image", "scan", "events"]
     camera: Name = ""
@@ -63,7 +63,7 @@ class Entry(_Record):
 
     @property
     def source(self) -> str:
-        """What it holds, such as "image of cam.frames"."""
+        """Contents of the file, such as "image of cam.frames"."""
         sensor = f"{self.camera}.{self.channel}" if self.kind == "image" else self.camera or self.lidar
         return f"{self.kind} of {sensor}"
 
@@ -112,18 +112,18 @@ class Capture:
 
     @property
     def file_hashes(self) -> frozenset[str]:
-        """SHA-256 of every image, scan and stretch of events in it."""
+        """SHA-256 of every image, scan and range of events in it."""
         return frozenset(entry.sha256 for entry in self._manifest.files)
 
     @property
     def contents(self) -> list[dict[str, Any]]:
-        """What samples it holds: sensor, timestamps and SHA-256 of each file, in a fixed order."""
+        """Sensor, timestamps and SHA-256 of each file, in a fixed order."""
         files = sorted(self._manifest.files, key=lambda entry: entry.sha256)
         return [entry.model_dump(exclude={"file", "bytes"}, exclude_unset=True) for entry in files]
 
     @property
     def times_ns(self) -> list[int]:
-        """When its samples arrived, on this computer's clock; their own timestamps where that is unknown."""
+        """Times of arrival of its samples, on this computer's clock; their timestamps if unknown."""
         files = self._manifest.files
         arrivals = [entry.host_ns for entry in files if entry.host_ns is not None]
         stamps = [entry.last_ns if entry.kind == "events" else entry.stamp_ns for entry in files]
@@ -131,7 +131,7 @@ class Capture:
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial numbers by sensor, as far as the devices told them when it was taken."""
+        """Serial numbers by sensor, as far as the devices had reported them."""
         serials = self._manifest.meta.get(SERIALS)
         items = serials.items() if isinstance(serials, dict) else ()
         return {name: serial for name, serial in items if isinstance(serial, str) and serial}
@@ -148,7 +148,7 @@ class Capture:
 
     @property
     def sources(self) -> list[str]:
-        """What it holds, such as "image of cam.frames"."""
+        """Contents of each file, such as "image of cam.frames"."""
         return [entry.source for entry in self._manifest.files]
 
     @property

@@ -95,7 +95,7 @@ def store_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> bool:
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Read what `store_arrays` wrote; None if there is no entry or it is damaged, by its checksums."""
+    """Read the arrays of `store_arrays`; None if the entry is missing or damaged, by its checksums."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
@@ -185,7 +185,7 @@ def replacing(
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
             for other in root.glob(f"{DRAFT}{folder.name}-*"):
-                # Of a killed process; those of living ones are locked.
+                # Drafts of killed processes; those of running ones are locked.
                 with suppress(OSError), _locked(other, waits=False):
                     shutil.rmtree(other, ignore_errors=True)
             draft.mkdir()

@@ -14,9 +14,9 @@ FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
     r"description|nominal_extrinsics|exports|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
 ).fullmatch
-# Known later than the first capture, perhaps; another one is another rig.
+# Keys that may be filled in after the first capture; a changed value means another rig.
 _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
-# Another one of these is another rig, whatever else agrees: samples were read by them.
+# Keys whose change means another rig, even if all others agree: samples were read by them.
 _OF_THE_RIG = re.compile(
     r"name|robot|(lidars|cameras)\.[^.]+\.(serial|model)|cameras\.[^.]+\.channels\.[^.]+\.kind"
 ).fullmatch
@@ -98,14 +98,14 @@ def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
 def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys by which two profiles are of different rigs: name, robot, sensors and their channels.
 
-    Board, intrinsics, limits and what else is measured or chosen may differ.
+    Board, intrinsics, limits and other measured or chosen values may differ.
     """
-    # A sensor or channel that one of them lacks differs in its model or kind.
+    # A sensor or channel missing from one profile is reported as a difference in model or kind.
     return [key for key in differing_keys(theirs, ours) if _OF_THE_RIG(key.name)]
 
 
 def keep_identity(earlier: Rig, rig: Rig) -> Rig:
-    """Give a profile the robot and the serial numbers that an earlier one of the same rig states."""
+    """Fill in a profile's robot and serial numbers from an earlier profile of the same rig."""
     lidars = {
         name: each.model_copy(update={"serial": each.serial or earlier.lidars[name].serial})
         for name, each in rig.lidars.items()

@@ -25,7 +25,7 @@ def provenance_of(session: Session) -> Provenance:
         SessionError: two units of one sensor took the captures.
     """
     date, imported = date_of(session), []
-    # When a capture came into the session, by its journal.
+    # Time at which a capture was added to the session, from its journal.
     for entry in [] if date else session.read_journal():
         if entry.get("event") == CAPTURED:
             with suppress(TypeError, ValueError, OverflowError):
@@ -41,7 +41,7 @@ def provenance_of(session: Session) -> Provenance:
 
 
 def serials_of(session: Session) -> dict[str, str]:
-    """Give the serial number of each sensor that told one, or whose profile states one.
+    """Return the serial number of each sensor that reported one, or whose profile states one.
 
     Raises:
         SessionError: two units of one sensor took the captures.
@@ -67,9 +67,9 @@ def stated_serials(rig: Rig) -> dict[str, str]:
 
 
 def date_of(session: Session) -> str | None:
-    """Give the time of a session's last capture: of arrival, else by its timestamps if these are UTC.
+    """Return the time of a session's last capture: of arrival, else by its timestamps if these are UTC.
 
-    None where the recording tells no time: the import into the session may be much later.
+    None if the recording carries no time: the import into the session may be much later.
     """
     times_ns = [time_ns for capture in _readable(session.captures) for time_ns in capture.times_ns]
     in_utc = [time_ns for time_ns in times_ns if _FIRST_UTC_NS <= time_ns < _LAST_UTC_NS]
@@ -81,11 +81,11 @@ def _in_utc(time: datetime) -> str:
 
 
 def content_sha256(session: Session) -> str:
-    """Fingerprint what results are computed from: the profile, all samples and timestamps of all captures.
+    """Return the SHA-256 of a result's inputs: the profile, all samples and timestamps of all captures.
 
-    It does not depend on where a session lies, on names of recordings, on the robot's name, or on how sensors
-    are reached. The order of captures counts, as random subsets are drawn by it. A capture is known by the
-    SHA-256 of its files in its manifest, which reading a capture checks.
+    It does not depend on the session's folder, the names of recordings, the robot's name, or the connection
+    of sensors. The order of captures counts, as random subsets depend on it. A capture contributes the
+    SHA-256 of its files from its manifest, which reading a capture checks.
     """
     digest = hashlib.sha256(_canonical(_profile(session.rig)))
     for capture in session.captures:
@@ -97,7 +97,7 @@ def content_sha256(session: Session) -> str:
 
 
 def _profile(rig: Rig) -> dict[str, Any]:
-    """List what a result depends on in a profile."""
+    """Return the parts of a profile that a result depends on."""
     profile = rig.model_dump(mode="json", exclude_defaults=True, exclude={"description", "robot", "exports"})
     for kind in ("lidars", "cameras"):
         for sensor in profile.get(kind, {}).values():

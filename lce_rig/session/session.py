@@ -93,7 +93,7 @@ class Session:
             lock = WriterLock(path / LOCK)
             (path / CAPTURES).mkdir(exist_ok=True)
             replace_file(path / PROFILE, dump_rig(rig).encode())
-            # Last, because its presence is what makes the folder a session.
+            # Last, because a folder with this file is a session.
             replace_file(path / MARKER, marker_of(rig))
         session = cls(path, rig, lock)
         session.journal("created", rig=rig.name, made_by=f"lce-rig {__version__}")
@@ -101,7 +101,7 @@ class Session:
 
     @classmethod
     def open(cls, path: Path | str, *, writable: bool = False) -> "Session":
-        """Open an existing session; for writing it also clears what a killed writer left behind.
+        """Open an existing session; opening for writing also clears the remains of a killed writer.
 
         Raises:
             SessionError: it is not a session, damaged, made by a newer version, or another process writes to
@@ -135,7 +135,7 @@ class Session:
     def resume(cls, path: Path | str, rig: Rig) -> "Session":
         """Continue the session of this rig in a folder, or start one there.
 
-        A session without captures takes the profile, whatever it differs in.
+        A session without captures takes the profile, even with differences.
 
         Raises:
             SessionError: as `create` and `open`, or the session belongs to another rig.
@@ -150,7 +150,7 @@ class Session:
             session.close()
             hint = "Collect into another folder, or use the profile in the session (its rig.yaml)."
             raise _of_another_rig(session, rig, differing, hint)
-        # What may differ: addresses of attached sensors, the robot, serial numbers.
+        # Allowed differences: addresses of attached sensors, the robot, serial numbers.
         adopted = rig if is_replaced else keep_identity(session.rig, rig)
         if adopted != session.rig:
             try:
@@ -163,15 +163,15 @@ class Session:
         return session
 
     def adopt(self, rig: Rig) -> str:
-        """Take another profile of the same rig as the session's; the earlier one stays beside it.
+        """Replace the session's profile by another of the same rig; the earlier one stays beside it.
 
-        Detections are found again where they depend on what changed, as their keys in the cache do.
+        Detections whose keys in the cache depend on the changes are computed again.
 
         Args:
             rig: with the session's name and sensors; board, intrinsics, limits and the like may differ.
 
         Returns:
-            The file that holds the earlier profile, such as "rig-1.yaml"; "" where both are the same.
+            The file of the earlier profile, such as "rig-1.yaml"; "" if both are the same.
 
         Raises:
             SessionError: the profile is of another rig, the session is open read-only, or the disk is full.
@@ -206,7 +206,7 @@ class Session:
 
     @property
     def other_profile(self) -> str | None:
-        """The text of the profile of `with_profile`; None where it is the session's own."""
+        """Text of the profile of `with_profile`; None if the session uses its own."""
         return self._other_profile
 
     def profile_content(self) -> bytes:
@@ -215,7 +215,7 @@ class Session:
         return (self.path / PROFILE).read_bytes() if other is None else other.encode()
 
     def _same_rig(self, rig: Rig) -> Rig:
-        """Give another profile this session's robot and serial numbers.
+        """Fill in another profile's robot and serial numbers from this session.
 
         Raises:
             SessionError: it is of another rig.
@@ -226,7 +226,7 @@ class Session:
         return keep_identity(self.rig, rig)
 
     def keep_text(self, text: str) -> None:
-        """Keep a profile's text with its comments, if it says what the session's profile says.
+        """Keep a profile's text with its comments, if it is equivalent to the session's profile.
 
         Raises:
             SessionError: the disk is full or read-only.
@@ -235,7 +235,7 @@ class Session:
             write_atomically(self.path / PROFILE_TEXT, text)
 
     def profile_text(self) -> str:
-        """Give the session's profile as its author wrote it, with comments; else every value of it."""
+        """Return the session's profile as its author wrote it, with comments; else all its values."""
         with suppress(OSError, ValueError):
             text = (self.path / PROFILE_TEXT).read_text(encoding="utf-8")
             if self._says(text):
@@ -245,7 +245,7 @@ class Session:
         return read_profile(find_profile(name)) if is_shipped else dump_rig(self.rig)
 
     def _says(self, text: str) -> bool:
-        """Tell whether a profile's text is that of this session, but for the robot and serial numbers."""
+        """Check whether a profile's text equals this session's, apart from the robot and serial numbers."""
         with suppress(LceRigError, KeyError):  # KeyError: it has other sensors
             return keep_identity(self.rig, parse_rig(text)) == self.rig
         return False
@@ -273,7 +273,7 @@ class Session:
 
     @property
     def rejected(self) -> list[Capture]:
-        """Every capture that was rejected, by name: nothing uses them, and `restore` takes one back.
+        """All rejected captures, sorted by name; they are not used, and `restore` takes one back.
 
         Raises:
             SessionError: their folder may not be read.
@@ -305,14 +305,14 @@ class Session:
         return self.rig.corrected(capture.scan(lidar))
 
     def reject(self, name: str, reason: str = "") -> None:
-        """Put a capture aside: it is used no more, and not collected again.
+        """Put a capture aside: it is no longer used, and not collected again.
 
         Args:
             name: of the capture.
             reason: kept in the journal.
 
         Raises:
-            SessionError: there is no capture of that name, the session is open read-only, or the disk is.
+            SessionError: the capture does not exist, or the session or its disk is read-only.
         """
         self.capture(name)
         self._move(name, CAPTURES, REJECTED, "rejected", reason=reason)
@@ -332,7 +332,7 @@ class Session:
         old, new = self.path / source / name, self.path / target / name
         if new.exists():
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
-        # First, so that nothing moves where the disk is full.
+        # First, so that the capture does not move if the disk is full.
         self.journal(event, capture=name, **fields)
         with writing(new):
             new.parent.mkdir(exist_ok=True)
@@ -391,7 +391,7 @@ class Session:
         return name
 
     def add_session(self, other: "Session") -> list[str]:
-        """Copy the captures of another session of this rig, but those that this one holds or has rejected.
+        """Copy the captures of another session of this rig, except those that this one holds or has rejected.
 
         Args:
             other: of the same board and sensors; limits and targets may differ.
@@ -418,7 +418,7 @@ class Session:
 
     @property
     def next_name(self) -> str:
-        """The name of the next capture; that of a rejected one is not given again."""
+        """Name of the next capture; names of rejected ones are not reused."""
         return f"{max((int(each.name) for each in self.captures + self.rejected), default=-1) + 1:06d}"
 
     def _require_lock(self) -> None:
@@ -452,7 +452,7 @@ class Session:
         return entries
 
     def cached(self, key: str) -> Path:
-        """Give the file of arrays kept under a key such as "3f9a1c/000012"."""
+        """Return the path of the arrays cached under a key such as "3f9a1c/000012"."""
         return self.path / DETECTIONS / f"{key}.npz"
 
     def _contents(self) -> dict[str, str]:
@@ -462,7 +462,7 @@ class Session:
                 try:
                     self._names_by_content.setdefault(capture.content_sha256, capture.name)
                 except SessionError:
-                    # A damaged capture is reported when it is read; nothing is a duplicate of it.
+                    # A damaged capture is reported when it is read, and has no duplicates.
                     continue
         return self._names_by_content
 
@@ -476,7 +476,7 @@ def _of_another_rig(session: Session, rig: Rig, keys: Sequence[DifferingKey], hi
 
 
 def discard_if_empty(path: Path) -> bool:
-    """Remove a session's folder if it holds nothing but the files of its creation.
+    """Remove a session's folder if it holds only the files of its creation.
 
     Args:
         path: the folder, without a writer.

@@ -1,1 +1,1 @@
-"""The clocks of a rig: fitted, tied to one another, and what they say about which samples belong together."""
+"""The clocks of a rig: their models, and the matching of samples by time and by number."""

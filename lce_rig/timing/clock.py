@@ -10,7 +10,7 @@ from lce_rig.core.geometry import Array
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
 FOREVER_NS = 2**62
-# A crystal's drift changes by about a part in a million as it warms up; no data say so once they have ended.
+# Change of a crystal's drift as it warms up, assumed for times outside the readings.
 WANDER = 1e-6
 
 
@@ -25,14 +25,14 @@ class ClockModel:
     Attributes:
         anchor_ns: time on the source's clock, in the middle of the data.
         reference_ns: time on the reference's clock at that moment.
-        drift: by how much faster the reference runs, as a fraction: 40e-6 is 40 ppm.
+        drift: excess of the reference's rate over the source's, as a fraction: 40e-6 is 40 ppm.
         cov: (2, 2) of the reference's time at the anchor in ns, and of `drift` in ns per ns.
         bias_sigma_ns: error common to all readings (an answer that is always slower than its request); it
             leaves no trace in their scatter.
         rms_ns: scatter of the readings about the line.
-        first_ns, last_ns: from when to when on the source's clock there were readings.
+        first_ns, last_ns: range of the readings on the source's clock.
         n_used: readings the line was fitted to, without outliers.
-        origin: what the readings were, in words: "98 time requests".
+        origin: the readings in words: "98 time requests".
     """
 
     anchor_ns: int
@@ -48,7 +48,7 @@ class ClockModel:
 
     @staticmethod
     def identity(sigma_ns: float, origin: str) -> "ClockModel":
-        """Build the model of a clock that shows the reference's time already.
+        """Build the model of a clock that already shows the reference's time.
 
         Args:
             sigma_ns: how well it does.
@@ -114,7 +114,7 @@ class ClockModel:
 
 
 def resolve_hour(past_hour_ns: int, near_ns: int) -> int:
-    """Complete a time that is known past the hour only.
+    """Complete a time that is known only within the hour.
 
     Args:
         past_hour_ns: time since the full hour; may exceed an hour where a counter has not wrapped yet.

@@ -27,9 +27,9 @@ _MIN_INLIERS = 3
 _MAX_PAIRS = 2048
 _N_WITNESSES = 3
 _STEP_SIGMAS = 8.0
-# Smaller steps are no jumps, however exact the readings are.
+# Least step that counts as a jump, even with exact readings.
 _MIN_STEP_NS = 200_000.0
-# Drift changes with temperature: older readings do not count.
+# Length of the fitted window: drift changes with temperature, so older readings are dropped.
 _WINDOW_NS = 60 * NS_PER_S
 
 Stamps = NDArray[np.int64]
@@ -40,24 +40,24 @@ def fit_clock(
 ) -> ClockModel | None:
     """Fit offset and drift to readings of two clocks, without outliers.
 
-    The quickest two fifths of the readings count. What one of them took beyond the very quickest,
-    e_i = bound_i - min bound, put its middle wrong by up to +-e_i: by all of it where one way had it, by
-    nothing where both had half. Which it was, a third unknown tells that is common to all,
+    Only the quickest two fifths of the readings are used. The delay of a reading beyond the quickest one,
+    e_i = bound_i - min bound, shifts its middle by up to +-e_i: fully if the delay was all on one way, not at
+    all if both ways shared it equally. The asymmetry a is a third unknown, common to all readings:
 
         reference_i - source_i = offset + drift t_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)
 
-    or else a machine that becomes slower to answer while it is asked would pass for a drift. The quickest
-    round trip itself may have been all on one way, in the same manner every time: that does not scatter, and
-    is stated as bias_sigma = min bound / sqrt(3).
+    Without it, answers that become slower would look like a drift. The quickest round trip may be asymmetric
+    too, in the same way every time. Such an error does not scatter; it is stated as
+    bias_sigma = min bound / sqrt(3).
 
     Args:
         source_ns: (N,) readings of the clock to be modelled; rising.
-        reference_ns: (N,) readings of the clock that it is modelled on.
-        what: what they are, in words: "time requests".
-        bound_ns: (N,) by how much two readings may lie apart in truth; None where they are of one edge.
+        reference_ns: (N,) readings of the reference clock.
+        what: the readings in words: "time requests".
+        bound_ns: (N,) bound on the time between both readings of a pair; None if they are of one edge.
 
     Returns:
-        The model; None from fewer than 4 readings, or where all are of the same time.
+        The model; None with fewer than 4 readings, or if all are of the same time.
     """
     n_readings = len(source_ns)
     if n_readings < MIN_PAIRS:
@@ -94,7 +94,7 @@ def fit_clock(
 def match_edges(
     source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
 ) -> tuple[Stamps, Stamps]:
-    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
+    """Match edges timestamped by one clock to those of another, by a coarse model of the two.
 
     Args:
         source_ns: (N,) edges on the one clock; rising.
@@ -127,13 +127,13 @@ class LineFit:
         y_i = offset + drift x_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)                              (1)
         sigma_i^2 = (e_0^2 + e_i^2) / 3,      e_0 the tenth part quantile of e                             (2)
 
-    with e_i the delay that could have put reading i wrong by up to +-e_i.
+    with e_i the delay that may shift reading i by up to +-e_i.
 
     Attributes:
         x_s: (N,) time on the source's clock.
         y_ns: (N,) the reference's time minus the source's.
         excess_ns: (N,) e_i; 0 for edges.
-        origin_s: what was subtracted from x to centre it.
+        origin_s: time subtracted from x to centre it.
     """
 
     x_s: Array
@@ -165,9 +165,9 @@ class LineFit:
     def covariance(self, are_delayed: bool) -> Array:
         """Compute the covariance (2, 2) of offset and drift.
 
-        Edges err each by itself. Delays stay as they are for a while, and then are others: readings of one
-        stretch of time err together. How much that matters, the jackknife over stretches tells: where its
-        covariance is r > 1 times that of independent readings, that one is multiplied by r.
+        The errors of edges are independent. Delays persist for a while and then change, so readings of one
+        stretch of time err together. The jackknife over stretches measures this: if its covariance is r > 1
+        times that of independent readings, the latter is multiplied by r.
 
         References:
             `lce_rig.calibrate.quadratics.Quadratics.jackknife_covariance`, which has the factor as well.
@@ -211,7 +211,7 @@ class LineFit:
 
 
 def median_slope(x: Array, y: Array) -> float:
-    """Compute the median slope between points half the data apart; bears a quarter of outliers.
+    """Compute the median slope between points half the data apart; robust to a quarter of outliers.
 
     References:
         Theil, "A rank-invariant method of linear and polynomial regression analysis", 1950 (method I).
@@ -226,7 +226,7 @@ class ClockStep(NamedTuple):
 
     Attributes:
         source_ns: first reading of the source's clock after it.
-        size_ns: by how much the reference, seen from the source, went ahead.
+        size_ns: advance of the reference relative to the source.
     """
 
     source_ns: int
@@ -250,7 +250,7 @@ class ClockTracker:
     """
 
     def __init__(self, what: str) -> None:
-        """Begin without readings; `what` they are, in words: "time requests"."""
+        """Begin without readings; the argument describes them in words: "time requests"."""
         self.steps: list[ClockStep] = []
         self._what = what
         self._pairs: deque[_Pair] = deque(maxlen=_MAX_PAIRS)
@@ -259,12 +259,12 @@ class ClockTracker:
         self._n_new = 0
 
     def add(self, source_ns: int, reference_ns: int, bound_ns: float = 0.0) -> None:
-        """Take a reading of both clocks, and note the jump that it proves, if it does.
+        """Take a reading of both clocks, and record a jump if it proves one.
 
         Args:
             source_ns: on the source's clock.
             reference_ns: on the reference's.
-            bound_ns: by how much the two may lie apart in truth.
+            bound_ns: bound on the time between the two.
         """
         pair = _Pair(source_ns, reference_ns, bound_ns)
         if self._pairs:
@@ -288,7 +288,7 @@ class ClockTracker:
 
     @property
     def model(self) -> ClockModel | None:
-        """The model of the readings so far; None while there are too few."""
+        """The model of the readings so far; None with too few."""
         return self._latest(max_new=1)
 
     def restart(self) -> None:
@@ -317,7 +317,7 @@ class ClockTracker:
             self._step(self._suspects, round(float(np.median(sizes_ns))))
 
     def _step(self, pairs: list[_Pair], size_ns: int) -> None:
-        """Begin a new model with the readings that prove a jump."""
+        """Start a new model with the readings that prove a jump."""
         self.steps.append(ClockStep(pairs[0].source_ns, size_ns))
         self.restart()
         self._pairs.extend(pairs)

@@ -1,8 +1,9 @@
-"""Every sensor's timestamps on one clock, tied while collecting goes on.
+"""All sensors' timestamps on one clock, synchronised during collection.
 
-With a sync board that is UTC as the board has it: the LiDAR's own where it is locked to the board's pulses,
-images by the pulses that made them, an event camera by the edges it saw, all else by the computer's clock
-and the board's answers. Without one everything stays on the computer's clock.
+With a sync board this clock is UTC as the board has it. A LiDAR locked to the board's pulses is on it
+already. Images are timed by the pulses that triggered them, and an event camera by the edges that it saw. All
+others are converted by the computer's clock and the board's answers. Without a board, all timestamps stay on
+the computer's clock.
 """
 
 from collections import deque
@@ -23,27 +24,27 @@ from lce_rig.timing.triggers import TriggerMatcher
 
 _N_EDGES = 2048
 _WINDOW_NS = 60 * NS_PER_S
-# Of the least time between two pulses: an edge farther from its pulse could be the next one's.
+# Share of the least time between two pulses within which an edge belongs to a pulse.
 _NEAR = 0.4
 _MIN_MATCHED = 0.5
-#: Pulses a second at which the first images are matched.
+#: Rate of the pulses while the first images are matched.
 SLOW_TRIGGERS_HZ = 4.0
-# A DAVIS takes the computer's time when it is opened.
+# Error of a DAVIS's clock, which is set to the computer's time when it is opened.
 _COARSE_EDGE_NS = 100_000_000.0
-# A locked VLP-16 counts whole microseconds.
+# Error of a locked VLP-16, which counts whole microseconds.
 _LOCKED_SIGMA_NS = 1_000.0
-# A board that a person moves by hand, in haste.
+# Speed of a board that is carried in haste.
 BOARD_SPEED_MPS = 1.0
 
 
 class SyncVerdict(NamedTuple):
-    """Whether boards must stand still while they are captured; `reasons` are empty where they may move."""
+    """Whether boards must stand still while they are captured; `reasons` is empty if they may move."""
 
     reasons: tuple[Finding, ...]
 
     @property
     def requires_still_boards(self) -> bool:
-        """Whether they must."""
+        """Whether boards must stand still."""
         return bool(self.reasons)
 
     @property
@@ -53,13 +54,13 @@ class SyncVerdict(NamedTuple):
 
 
 class EdgeClock:
-    """Pulses of the board and edges that a sensor saw, and the board's time on that sensor's clock.
+    """The board's time on a sensor's clock, fitted to the board's pulses and the edges that the sensor saw.
 
-    A DAVIS346 stamps the edges at its trigger input and does not number them. Which edge is which pulse
-    follows from a coarse model of its clock; once a fit is made, the fit itself decides.
+    A DAVIS346 timestamps the edges at its trigger input without numbers. Edges are matched to pulses by a
+    coarse model of its clock and, once a fit exists, by the fit.
 
     Attributes:
-        problem: why there is no model; None while there is one.
+        problem: why a model is not available; None with one.
     """
 
     def __init__(self, sensor: str, coarse_error_ns: float) -> None:
@@ -67,7 +68,7 @@ class EdgeClock:
 
         Args:
             sensor: its name in the profile.
-            coarse_error_ns: how far off the coarse model may be.
+            coarse_error_ns: largest error of the coarse model.
         """
         self.problem: Finding | None = findings.NO_EDGES(sensor)
         self._sensor = sensor
@@ -100,12 +101,12 @@ class EdgeClock:
         self._model = None
 
     def fit(self) -> ClockModel | None:
-        """Fit the board's time on the sensor's clock to the last minute's edges; None where it cannot be."""
+        """Fit the board's time on the sensor's clock to the last minute's edges; None if that fails."""
         start = self._model or self._coarse
         if start is None or len(self._sent_ns) < MIN_PAIRS or not self._seen_ns:
             return None
         sent_ns = _recent(self._sent_ns)
-        # Edges whose pulses are known; others say nothing.
+        # Only edges in the time range of known pulses.
         back, seen_ns = start.inverse(), _recent(self._seen_ns)
         first_ns = back.convert(int(sent_ns[0])) - self._coarse_error_ns
         last_ns = back.convert(int(sent_ns[-1])) + self._coarse_error_ns
@@ -131,19 +132,19 @@ def _recent(times_ns: deque[int]) -> Stamps:
 
 
 class RigClock:
-    """Puts samples onto the rig's clock: the same while collecting and for `doctor`.
+    """Puts samples onto the rig's clock, for `collect` and `doctor` alike.
 
     Attributes:
-        models: by the sensor's name, from its clock to the rig's; what was placed before keeps its time.
+        models: by the sensor's name, from its clock to the rig's; samples placed earlier keep their time.
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:
-        """Begin with nothing tied.
+        """Begin without models.
 
         Args:
-            rig: says which sensors there are, and which of the board's lines triggers which.
-            has_board: whether a sync board is there.
-            edge_cameras: cameras that stamp the board's edges themselves.
+            rig: the profile, with the sensors and their trigger lines.
+            has_board: whether a sync board is attached.
+            edge_cameras: cameras that timestamp the board's edges themselves.
         """
         self.models: dict[str, ClockModel] = {}
         self._rig = rig
@@ -167,11 +168,11 @@ class RigClock:
 
     @property
     def needs_slow_triggers(self) -> bool:
-        """Whether pulses at the profile's rates are too quick to tell yet which made which image."""
+        """Whether pulses at the profile's rates are still too fast to match images to them."""
         return any(matcher.problem is not None for matcher in self._quick)
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
-        """Take a sample of a source, and give those whose time is now known, on the rig's clock."""
+        """Take a sample of a source, and return those whose time is now known, on the rig's clock."""
         if isinstance(sample, Pulse):
             return self._take_pulse(source, sample)
         matcher = self._matchers.get(sample.sensor)
@@ -184,7 +185,7 @@ class RigClock:
         return [self.place(sample)]
 
     def place(self, sample: Sample) -> Sample:
-        """Return a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
+        """Return a sample with timestamps on the rig's clock; unchanged without a model of its sensor."""
         model = self.models.get(sample.sensor)
         if model is None:
             return sample
@@ -202,7 +203,7 @@ class RigClock:
             locked: LiDARs whose timestamps are UTC by the board's pulses.
         """
         self._host, self._utc = host_clock, utc_clock
-        # For timestamps of the computer's time; None where it is the rig's clock itself.
+        # For timestamps of the computer's time; None if that is the rig's clock itself.
         host = host_clock.inverse().then(utc_clock) if host_clock and utc_clock else None
         for name in self._rig.lidars:
             own = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
@@ -221,17 +222,17 @@ class RigClock:
             self._tie(name, None if model is None else model.then(board_clock))
 
     def edge_clock(self, camera: str) -> tuple[ClockModel | None, Finding | None]:
-        """Return the board's time on the clock of a camera that stamps its edges; or why there is none."""
+        """Return the board's time on the clock of a camera that timestamps its edges, or the problem."""
         return self._edge_models.get(camera), self._edges[camera].problem
 
     def problems(self) -> list[Finding]:
-        """List which clocks are not tied as they should be, and why."""
+        """List the clocks without the expected synchronisation, and why."""
         matchers = [each.problem for each in self._matchers.values()]
         edges = [each.problem for each in self._edges.values()]
         return [problem for problem in matchers + edges if problem is not None]
 
     def account(self) -> list[Finding]:
-        """List the cameras whose counts, or those of their pulses, began anew so far."""
+        """List the cameras whose counts, or those of their pulses, have restarted."""
         return [
             Finding(findings.SLIPPED.code, findings.SLIPPED.severity, name, matcher.figures())
             for name, matcher in self._matchers.items()
@@ -241,8 +242,7 @@ class RigClock:
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured.
 
-        A board that is carried moves by a metre in a second: the times must be known to within
-        quality.max_motion_m / (1 m/s).
+        A carried board moves at 1 m/s, so the times must be accurate to quality.max_motion_m / (1 m/s).
         """
         if not self._has_board:
             return SyncVerdict((findings.NO_BOARD(),))
@@ -285,7 +285,7 @@ class RigClock:
         return [self._at_pulse(each.image, each.stamp_ns) for each in matched] if was_matching else []
 
     def _at_pulse(self, image: Image, board_ns: int) -> Image:
-        """Stamp an image by the pulse that made it; as it is while no clock is known."""
+        """Timestamp an image by the pulse that triggered it; unchanged while no clock is known."""
         clock = self._utc or self._host
         if clock is None:  # A clock that jumped has no model until a few answers have come.
             return image

@@ -1,4 +1,4 @@
-"""The rig's time, common to all sensors, and streams cut into frames: a scan and what others saw then."""
+"""The rig's time, common to all sensors, and frames: a scan with the images and events of its time."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
-    """Name a camera's channel of kind events; None where it has none."""
+    """Name a camera's channel of kind events; None without one."""
     return rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
 
 
@@ -45,7 +45,7 @@ def rig_offset_ns(stream: Stream, rig: Rig) -> int:
 
 
 def rig_time_ns(sample: Sample, rig: Rig) -> int | None:
-    """Bring a sample's timestamp to the rig's time; None where it carries none."""
+    """Convert a sample's timestamp to the rig's time; None without a timestamp."""
     stamp_ns = stamp_of(sample)
     return None if stamp_ns is None else stamp_ns + rig_offset_ns(stream_of(sample, rig), rig)
 
@@ -55,19 +55,19 @@ BEFORE_NS = 1_200_000_000
 AFTER_NS = 150_000_000
 """... and after its last, for the board to be followed."""
 
-# A clock that is fitted again while events come may move them back by microseconds.
+# Largest step back of events that does not count as a restart: refitting a clock moves them by microseconds.
 _MAX_BACK_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class EventCut:
-    """A stretch of one camera's stream.
+    """A range of one camera's stream.
 
     Attributes:
         packets: those with its events, at least one event.
         start_ns, end_ns: on the events' own clock.
-        offset_ns: what brings their timestamps to the rig's time.
-        missing_ns: how much of the stretch's beginning lies before the stream; 0 where it is whole.
+        offset_ns: added to its timestamps to get the rig's time.
+        missing_ns: length of its beginning that lies before the stream; 0 if it is complete.
     """
 
     packets: tuple[Events, ...]
@@ -78,8 +78,8 @@ class EventCut:
 
     @cached_property
     def events(self) -> Events:
-        """Every event with start_ns <= t < end_ns; joined only when wanted, as most frames show no board."""
-        # Arrival is known of a packet's first event, not of a stretch's.
+        """Every event with start_ns <= t < end_ns; joined on first use, as most frames show no board."""
+        # The arrival time is known for a packet's first event only.
         return replace(join_events(self.packets).between(self.start_ns, self.end_ns), host_ns=None)
 
     @property
@@ -97,14 +97,14 @@ class EventCut:
 
 
 class EventBuffer:
-    """Holds the packets of every event camera, and hands out those around a scan without copying."""
+    """Holds the packets of every event camera, and returns those around a scan without copying."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._streams: dict[str, _Stream] = {}
 
     def add(self, events: Events) -> None:
-        """Take a camera's next packet, not empty; a clock that was set back begins its stream again."""
+        """Take a camera's next packet, not empty; the stream restarts if its clock was set back."""
         first_ns, stream = int(events.t_ns[0]), self._streams.get(events.sensor)
         if stream is None or first_ns < stream.last_ns - _MAX_BACK_NS:
             offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
@@ -115,7 +115,7 @@ class EventBuffer:
         stream.last_ns = int(events.t_ns[-1])
 
     def forget_before(self, time_ns: int) -> None:
-        """Drop the packets before a time of the rig's clock, but the last of each stream."""
+        """Drop the packets before a time of the rig's clock, except the last of each stream."""
         for stream in self._streams.values():
             packets, until_ns = stream.packets, time_ns - stream.offset_ns
             while len(packets) > 1 and packets[0].t_ns[-1] < until_ns:
@@ -145,7 +145,7 @@ class _Stream:
     """One camera's packets.
 
     Attributes:
-        offset_ns: what brings timestamps to the rig's time.
+        offset_ns: added to timestamps to get the rig's time.
         first_ns, last_ns: timestamps of the first event of all and of the last.
     """
 
@@ -156,7 +156,7 @@ class _Stream:
 
 
 PATIENCE_NS = 1_000_000_000
-#: How long events wait for a scan: in a bag, scans are late by up to two seconds beside their own waiting.
+#: Time for which events are kept for scans, which in a bag may be up to two seconds late.
 IN_BAGS_NS, LIVE_NS = 3 * PATIENCE_NS, 3 * PATIENCE_NS // 2
 _Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 
@@ -187,20 +187,20 @@ def pair_by_time(
     *,
     are_events_enough: bool = False,
 ) -> Iterator[Frame]:
-    """Return each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
+    """Yield each scan of the first LiDAR heard with the nearest image of each camera channel and its events.
 
-    Of a rig without cameras, return each with the nearest scans of other LiDARs; without LiDARs, each image
+    For a rig without cameras, yield each with the nearest scans of other LiDARs; without LiDARs, each image
     of the first camera heard with the nearest ones of others.
 
-    Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
-    has gone by. Where clocks are set back, what waits is given up.
+    Samples come in order of receipt: a scan waits until every other sensor has passed its time, or for a
+    second. If clocks are set back, waiting samples are dropped.
 
     Args:
         samples: images, scans and packets of events; each sensor's timestamps rise.
-        rig: says what to add to timestamps, and how far pairs may lie apart.
-        losses: receives the scans without an image within the tolerance, and how near the nearest was.
-        events_wait_ns: how long events are kept for scans that wait or come late.
-        are_events_enough: whether a scan without an image, but with events, is a frame, too.
+            rig: the profile, with time offsets and the tolerance of pairs.
+            losses: counts the scans without an image within the tolerance, with the least time difference.
+            events_wait_ns: time for which events are kept for scans that wait or come late.
+            are_events_enough: whether a scan with events but without an image is a frame, too.
     """
     pairing = _Pairing(rig, losses, BEFORE_NS + AFTER_NS + events_wait_ns, are_events_enough)
     for sample in samples:
@@ -210,7 +210,7 @@ def pair_by_time(
 
 
 class _Pairing:
-    """Samples of the first sensor that wait, and what has come of the others."""
+    """Waiting samples of the first sensor, and recent samples of the others."""
 
     def __init__(self, rig: Rig, losses: Losses, kept_ns: int, are_events_enough: bool) -> None:
         self._rig = rig
@@ -223,11 +223,11 @@ class _Pairing:
         self._events = EventBuffer(rig)
         self._kind: type[Image | Scan] = Scan if rig.lidars else Image
         self._anchor: tuple[str, str] | None = None
-        # How far images and scans have come, and all of them.
+        # Latest time of images and scans, and of all samples.
         self._newest_ns = self._position_ns = -(2**62)
 
     def take(self, sample: Sample) -> None:
-        """Put a sample where it waits to be paired."""
+        """Add a sample to the waiting ones or to its sensor's buffer."""
         time_ns = rig_time_ns(sample, self._rig)
         if time_ns is None:
             return
@@ -250,14 +250,14 @@ class _Pairing:
             else:
                 buffer = self._buffers.setdefault(key, deque())
                 buffer.append((time_ns, sample))
-                # Of a recording whose scans come later, or never.
+                # Drop old samples of a recording whose scans come later, or never.
                 while buffer[0][0] < time_ns - self._kept_ns:
                     buffer.popleft()
         self._position_ns = max(self._position_ns, time_ns)
         self._events.forget_before(self._position_ns - self._kept_ns)
 
     def due_frames(self) -> Iterator[Frame]:
-        """Yield the frames that nothing more can come for."""
+        """Yield the frames that no further sample can change."""
         while self._waiting:
             time_ns, half_ns, _ = self._waiting[0]
             have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
@@ -268,7 +268,7 @@ class _Pairing:
             yield from self._frame(*self._waiting.popleft())
 
     def remaining_frames(self) -> Iterator[Frame]:
-        """Yield what waits when the streams have ended."""
+        """Yield the frames still waiting at the end of the streams."""
         while self._waiting:
             yield from self._frame(*self._waiting.popleft())
 
@@ -278,7 +278,7 @@ class _Pairing:
         nearest_ns: int | None = None
         for key in sorted(self._buffers):
             buffer = self._buffers[key]
-            # What lies before the nearest sample cannot be nearest to any later scan.
+            # Samples before the nearest one cannot be nearest to any later scan.
             while len(buffer) > 1 and abs(buffer[1][0] - time_ns) <= abs(buffer[0][0] - time_ns):
                 buffer.popleft()
             if not buffer:
@@ -308,7 +308,7 @@ class _Pairing:
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
-    """Find the rig's time at the middle of a scan; None where the scan carries no timestamp."""
+    """Find the rig's time at the middle of a scan; None without a timestamp."""
     time_ns = rig_time_ns(scan, rig)
     return None if time_ns is None else time_ns + _half_sweep_ns(scan, rig)
 

@@ -1,10 +1,10 @@
 """Triggered images and the pulses that made them, matched by their running numbers.
 
-A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, which a few
-images at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
-nor a lost line can mix them up. The camera's timestamps still check the constant: a pulse that the camera
-missed, or a frame that its driver did not number, shifts every later image by whole pulses, and the constant
-is sought again.
+A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, found from the
+times of a few images at the start. From then on images are matched by number only, so that a busy computer or
+a lost line cannot mix them up. The camera's timestamps still check the constant: a pulse that the camera
+missed, or a frame that its driver did not number, shifts every later image by whole pulses. The constant is
+then determined again.
 """
 
 from collections import Counter, deque
@@ -18,16 +18,16 @@ from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.timing import findings
 from lce_rig.timing.clock import ClockModel
 
-# VersaVIS, too, asks for four in a row.
+# Images in a row that must agree on the constant; VersaVIS requires four, too.
 N_AGREE = 4
 
 _N_WAITING = 64
 _N_DELAYS = 31
-# Of the time between two pulses: nearer than this, an image belongs to the pulse and to no other.
+# Largest deviation of an image's delay from the median, as a share of the pulses' period.
 _NEAR = 0.3
 _N_PULSES = 1024
 _N_RECENT = 8
-# From a pulse to the next whose line came, at most, for those between to be placed between the two.
+# Largest difference in number of two received pulses between which missing ones are interpolated.
 _MAX_STEPS = 8
 
 
@@ -85,11 +85,11 @@ class TriggerMatcher:
         self._last: tuple[int, int] | None = None
 
     def set_clock(self, board_from_camera: ClockModel) -> None:
-        """Take the board's time on the camera's clock, by which the start is found."""
+        """Take the board's time on the camera's clock, used to find the constant."""
         self._clock = board_from_camera
 
     def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
-        """Take a pulse, and give the images that waited for it."""
+        """Take a pulse, and return the images that waited for it."""
         last_count, last_ns = next(reversed(self._pulses.items()), (pulse.count - 1, 0))
         if pulse.count <= last_count:
             if self._pulses.get(pulse.count) == pulse.stamp_ns:
@@ -106,7 +106,7 @@ class TriggerMatcher:
         return list(self._proceed())
 
     def take_image(self, image: Image) -> list[TriggeredImage]:
-        """Take an image, and give those whose pulses are now known."""
+        """Take an image, and return those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self.counts["n_unmatched"] += 1
             is_numbered = image.count is not None
@@ -130,7 +130,7 @@ class TriggerMatcher:
             frame = self._waiting[0]
             last_count, last_ns = next(reversed(self._pulses.items()))
             if self._constant is None:
-                # Only when the pulses have come past an image's time are all that could be its own known.
+                # All candidate pulses are known only once the pulses have passed the image's time.
                 if last_ns <= frame.board_ns:
                     return
                 yield from self._seek(self._waiting.popleft())
@@ -143,7 +143,7 @@ class TriggerMatcher:
         """Look for the constant: the same for several images in a row, each with one possible pulse."""
         window_ns = self._max_delay_ns
         possible = [n for n, ns in self._pulses.items() if 0 <= frame.board_ns - ns <= window_ns]
-        # A pulse lost on the way is missing among the possible, and makes another look like the only one.
+        # If a pulse was lost on the way, another one may look like the only candidate.
         is_ambiguous = len(possible) > 1 or self._period_ns() < window_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:
@@ -165,7 +165,7 @@ class TriggerMatcher:
                 yield self._matched(each, each.number - constant)
 
     def _follow(self, frame: _Waiting, constant: int) -> Iterator[TriggeredImage]:
-        """Match by number, and keep an eye on the time."""
+        """Match by number, and check the time."""
         number = frame.number - constant
         if number not in self._pulses:
             self.counts["n_unmatched"] += 1
@@ -176,7 +176,7 @@ class TriggerMatcher:
             yield self._matched(frame, number)
             self._delays_ns.append(delay_ns)
             return
-        # One timestamp may be late; several in a row tell that the counts have slipped.
+        # One timestamp may be late; several in a row show that the counts have slipped.
         self.counts["n_unmatched"] += 1
         self._n_odd += 1
         if self._n_odd == N_AGREE:
@@ -188,7 +188,7 @@ class TriggerMatcher:
         return TriggeredImage(frame.image, number, pulse_ns, pulse_ns + round(median(self._delays_ns)))
 
     def _period_ns(self) -> float:
-        """Return the shortest time between two of the last few pulses; infinite where there is but one."""
+        """Return the shortest time between two of the last few pulses; infinite for a single pulse."""
         recent = islice(reversed(self._pulses.values()), _N_RECENT)
         return min((after - before for after, before in pairwise(recent)), default=float("inf"))
 

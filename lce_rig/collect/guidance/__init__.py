@@ -1,1 +1,1 @@
-"""Where to hold the board next, and how well the extrinsics are going to be known."""
+"""The next placement of the board, and the predicted uncertainty of the extrinsics."""

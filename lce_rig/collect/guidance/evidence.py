@@ -1,4 +1,4 @@
-"""The information of a board placement on the extrinsics, before it is captured; placements just add.
+"""Information of a board placement on the extrinsics, before its capture; placements add up.
 
 A placement becomes the returns, the ring ends and the image's pose that both sensors would measure there. The
 likelihood's own rows (`calibrate.likelihood.model`) give its information H_k on the extrinsics and on the
@@ -67,7 +67,7 @@ class Rings:
         return np.asarray(np.count_nonzero(self.n_points, axis=1))
 
     def of(self, chosen: NDArray[np.intp]) -> "Rings":
-        """Take some of the boards."""
+        """Select some of the boards."""
         return Rings(self.n_points[chosen], self.ends[chosen])
 
 
@@ -137,13 +137,13 @@ class Evidence:
     n_points: Array
 
     def of(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Evidence":
-        """Take some of the placements."""
+        """Select some of the placements."""
         return Evidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """Covariances to expect of extrinsics, tangent (translation m, rotation rad), axes of the camera.
+    """Predicted covariances of the extrinsics, tangent (translation m, rotation rad), axes of the camera.
 
     Attributes:
         cov: (..., 6, 6) that the calibration will state.
@@ -280,7 +280,7 @@ def _straight_ahead(model: SensorModel) -> Array:
 
 
 def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
-    """Predict the covariance (N, 6, 6) that corner noise leaves of T_cam_board (N, 4, 4)."""
+    """Predict the covariance (N, 6, 6) of T_cam_board (N, 4, 4) due to corner noise."""
     corners, R = model.board.corners(), T_cam_board[:, :3, :3]
     levers = np.einsum("nij,kj->nki", R, corners)
     by_shift = model.lens.differentiate(levers + T_cam_board[:, None, :3, 3])

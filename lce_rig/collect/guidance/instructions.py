@@ -1,6 +1,6 @@
-"""From where the board is to where it should be, in words for the person who stands behind it.
+"""Instructions that lead the person behind the board from its present pose to the wanted one.
 
-That person faces the rig: what the camera sees on its right is on the person's left.
+The person faces the rig: the right side of the camera's view is on the person's left.
 """
 
 from collections.abc import Mapping
@@ -16,23 +16,23 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 STEP_M = 0.6
 MOST_AT_ONCE = 3
-#: Smaller differences are not mentioned: people cannot follow them, or need not.
+#: Differences, m and deg, below which no instruction is given: people cannot follow smaller ones.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
-#: Within so many dead bands of every wanted figure the board is there.
+#: Tolerance of every figure of a board at its wanted pose, in dead bands.
 THERE = 1.5
 
 
 @dataclass(frozen=True)
 class HeldPose:
-    """How a board is held, as the person thinks of it.
+    """Pose of a board in the terms of the person holding it.
 
     Attributes:
-        right_m: of its centre to the right of the camera's sight line, level.
+        right_m: offset of its centre to the right of the camera's sight line, level.
         ahead_m: level distance from the camera along that line.
-        up_m: above the camera.
-        tilt_deg: how far the top leans towards the rig.
-        turn_deg: how far the person's left side is turned towards the rig.
-        roll_deg: turn in its plane, counter-clockwise as the camera sees it, 0 where its width is level.
+        up_m: height above the camera.
+        tilt_deg: angle by which the top leans towards the rig.
+        turn_deg: angle by which the person's left side is turned towards the rig.
+        roll_deg: turn in its plane, counter-clockwise as the camera sees it, 0 with level width.
     """
 
     right_m: float
@@ -44,13 +44,13 @@ class HeldPose:
 
 
 def describe_pose(view: SensorPlace, T_cam_board: Array) -> HeldPose:
-    """Take a pose T_cam_board (4, 4) apart."""
+    """Decompose a pose T_cam_board (4, 4)."""
     centre = T_cam_board[:3, 3]
     right, ahead = _level_axes(view)
     ray = centre / np.linalg.norm(centre)
     R = facing_axes(view, ray[None])[0].T @ T_cam_board[:3, :3]
     normal = R[:, 2]
-    # Turned upright about the shortest way, what is left is the roll.
+    # Once the normal is turned level by the shortest way, the rest of the rotation is the roll.
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, normal[2])
@@ -66,7 +66,7 @@ def describe_pose(view: SensorPlace, T_cam_board: Array) -> HeldPose:
 
 
 def build_pose(view: SensorPlace, held: HeldPose) -> Array:
-    """Put T_cam_board (4, 4) together, the inverse of `describe_pose`."""
+    """Build T_cam_board (4, 4), the inverse of `describe_pose`."""
     right, ahead = _level_axes(view)
     centre = held.right_m * right + held.ahead_m * ahead + held.up_m * view.up
     distance_m = float(np.linalg.norm(centre))
@@ -83,7 +83,7 @@ def build_pose(view: SensorPlace, held: HeldPose) -> Array:
 
 
 def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str]:
-    """Say what to do, largest first, at most `MOST_AT_ONCE`; empty where the board is there.
+    """List the moves to make, largest first, at most `MOST_AT_ONCE`; empty at the wanted pose.
 
     Args:
         view: the sensors.
@@ -98,12 +98,12 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str
 
 
 def say(instructions: Mapping[Kind, str]) -> str:
-    """Join instructions to one sentence; "hold still" where there are none."""
+    """Join instructions to one sentence; "hold still" without any."""
     return ", ".join(instructions.values()) or "hold still"
 
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
-    """Return whether a board (4, 4) is as near to where it should be as people can hold it."""
+    """Check whether a board (4, 4) is as near to its wanted pose (4, 4) as people can hold it."""
     changes = _changes(view, present, wanted)
     return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
 

@@ -1,4 +1,4 @@
-"""The next placement, which shrinks the predicted covariance most, and those that a session lacks."""
+"""The placements that shrink the predicted covariance most: the next one, and those that a session lacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 
-#: A bar is full where captures span this share of what reachable placements span.
+#: Span of the captures that fills a bar, as a share of the reachable placements' span.
 FULL_SHARE = 0.7
-#: The board leans to a side from here on.
+#: Least angle of a board that is described as leaning to a side.
 LEANS_DEG = 15.0
-#: Boards turned in their plane by so much, least against most.
+#: Range of the boards' rolls that fills the bar.
 FULL_ROLL_DEG = 20.0
 
 
@@ -73,7 +73,7 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
 
 
 def _places(view: SensorPlace, T_cam_board: Array) -> Array:
-    """Where board centres lie in the image, px, and how far away they are, as a logarithm, (N, 3)."""
+    """Return the board centres' position in the image, px, and the logarithm of their distance, (N, 3)."""
     centre = T_cam_board[:, :3, 3]
     pixels, _ = view.model.lens.project(centre)
     # A centre out of sight counts as one at the image's middle.
@@ -84,13 +84,13 @@ def _places(view: SensorPlace, T_cam_board: Array) -> Array:
 
 #: The target counts as met when the calibration is predicted to state this share of it.
 ENOUGH_SHARE = 0.9
-#: A placement that brings less than this share of what the best one would adds nothing.
+#: Least gain of a new placement, as a share of the best placement's gain; below it, it adds nothing.
 LEAST_SHARE = 0.1
-#: Where even the best placement brings less than this share, any new one is welcome.
+#: Least gain of the best placement; below it, any new placement is accepted.
 LEAST_GAIN = 0.02
-#: Around a place that cannot be reached.
+#: Radius around an unreachable placement.
 AVOIDED_M = 0.4
-# A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
+# Relative increase of the cost per metre of way, and per radian of turn.
 _EFFORT = 0.01
 # Upper bound of the "captures left" shown to the user.
 _MOST_MORE = 60
@@ -101,18 +101,17 @@ _BEST = 40
 
 
 class Guidance(NamedTuple):
-    """What is known after some captures, and where the board should go next.
+    """State after some captures, and the next placement of the board.
 
     Attributes:
-        n_captures: placements held.
-        sigma_rotation_deg, sigma_translation_m: standard deviations that the calibration is predicted to
-            state now.
+        n_captures: number of captures.
+        sigma_rotation_deg, sigma_translation_m: predicted standard deviations of the calibration now.
         bound_rotation_deg, bound_translation_m: the same with a margin for few captures, which cannot show
             how noisy they are; they have to be at most `ENOUGH_SHARE` of the target.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
-        n_least: captures that it takes at least.
-        n_more: about how many more captures it takes; 0 where there are enough, None where not known.
-        T_cam_board: (4, 4) wanted; None where no reachable placement is new.
+        n_least: least number of captures.
+        n_more: approximate number of further captures; 0 if there are enough, None if unknown.
+        T_cam_board: (4, 4) wanted; None if no reachable placement is new.
     """
 
     n_captures: int
@@ -177,7 +176,7 @@ class Planner:
         avoid: Array | None = None,
         beside: Sequence[Beside] = (),
     ) -> Guidance:
-        """Predict how well the extrinsics are known, and choose where the board should go.
+        """Predict the standard deviations of the extrinsics, and choose the next placement.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far; N may be 0.
@@ -267,18 +266,18 @@ class Planner:
     ) -> Refusal | None:
         """Refuse a placement that would hardly shrink the predicted covariance.
 
-        Once the target is predicted to be met, and where nothing brings much any more, only a placement that
-        was captured before is refused: a user who continues wants more captures.
+        Once the target is predicted to be met, or the best gain is small, only a placement that was captured
+        before is refused: a user still collecting wants more captures.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
-            present: (4, 4) where the board is.
+            present: (4, 4) T_cam_board now.
             names: of the captures held; numbers from 1 by default.
             avoid: (M, 4, 4) as `guide` takes them: no board is refused for a better place out of reach.
-            asked: (4, 4) where the board was sent; there it is refused only where it was captured before.
+            asked: (4, 4) placement given to the user; a board there is refused only if captured before.
 
         Returns:
-            Why not to capture it and where to go instead; None where it adds something.
+            The reason and the better placement; None if it adds information.
         """
         guidance = self.guide(held, present, avoid)
         wanted = guidance.T_cam_board
@@ -307,18 +306,18 @@ class Planner:
     def _count_more(
         self, cov: Array, improvable: Array, then: Array | None, n_captures: int, n_least: int
     ) -> int | None:
-        """Estimate how many more captures it takes, if each brings as much information as the next one.
+        """Estimate how many more captures are needed, if each adds as much information as the next one.
 
         Args:
             cov: (6, 6) predicted now.
             improvable: (6, 6) the part of it that captures can shrink.
-            then: (6, 6) that part after the next capture; None where no placement is new.
+            then: (6, 6) that part after the next capture; None if no placement is new.
             n_captures: so far.
             n_least: captures needed at least.
         """
         model = self.view.model
         targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))
-        # More captures change nothing of what all share.
+        # Errors common to all captures do not shrink.
         constant = np.square(sigmas(cov - improvable))
         before, after = (
             1 / np.maximum(np.square(sigmas(s)), 1e-18)
@@ -331,7 +330,7 @@ class Planner:
         return None
 
     def _choose(self, cost: Array, held: Array, present: Array | None) -> int | None:
-        """Choose the candidate of the least finite cost that is new; None where there is none."""
+        """Choose the candidate of the least finite cost that is new; None if no such candidate exists."""
         is_taken = self._is_like(held, self.candidates).any(axis=0)
         new = np.flatnonzero(~is_taken & np.isfinite(cost))
         if not len(new):
@@ -339,19 +338,19 @@ class Planner:
         ranked = new[np.argsort(cost[new], kind="stable")]
         if present is None or not self._is_like(held, present[None]).any():
             return int(ranked[0])
-        # Move a board that stands at a capture on, not to where the instruction is "hold still".
+        # Move the board away from a captured placement, not to one whose instruction is "hold still".
         away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
         return int(next(away, ranked[0]))
 
     def _is_like(self, held: Array, others: Array) -> NDArray[np.bool_]:
-        """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+        """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
         return find_alike(held, others, self._min_move_m, self._min_turn_rad)
 
 
 _FEWEST, _MOST = 2, 6
-# Boards whose distances differ by this factor or more are near and far ones.
+# Least ratio of distances of boards that are described as near and far ones.
 _FAR = 1.4
-# A LiDAR beside the camera that looks the same way: people need no more to know where to stand.
+# Default T_cam_lidar: a LiDAR beside the camera, facing the same way; accurate enough to place a board.
 _SAME_WAY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -360,17 +359,17 @@ def plan_captures(
 ) -> list[Finding]:
     """Plan the captures to add, each where it reduces the uncertainty most after those before it.
 
-    They end when the standard deviations, as the calibration states them now and the model lets them shrink,
-    are predicted to meet the profile's target.
+    The plan ends when the predicted standard deviations, scaled to those of the calibration, meet the
+    profile's target.
 
     Args:
         rig: the profile.
         camera, lidar: the sensors.
         held: (N, 4, 4) T_cam_board of the captures so far.
-        calibration: their result; None where they give none.
+        calibration: their result; None without one.
 
     Returns:
-        The plan; nothing where the LiDAR's beams are not known, or no new placement is left.
+        The plan; empty if the LiDAR's beams are unknown, or no new placement is left.
     """
     try:
         model = SensorModel.of(rig, camera, lidar)
@@ -382,7 +381,7 @@ def plan_captures(
         T_cam_lidar = calibration.T_cam_lidar
     planner, wanted, needed = Planner(SensorPlace(model, T_cam_lidar)), held, rig.calibration
     guidance = planner.guide(held)
-    # What the calibration states over what the model predicts.
+    # Ratio of the calibration's standard deviations to the predicted ones.
     ratios = np.ones(2)
     if calibration is not None:
         stated = np.array([calibration.sigma_rotation_deg, calibration.sigma_translation_m])
@@ -401,11 +400,11 @@ def plan_captures(
 
 
 def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, tuple[str, ...]], ...]:
-    """Describe boards (N, 4, 4) as near ones and far ones.
+    """Describe boards (N, 4, 4) in a near and a far group.
 
     Returns:
-        Of each group the number, the mean distance in m, its place in the image if that is aside,
-        and the tilts, as the person who holds the board has them: where they face.
+        For each group the number, the mean distance in m, its place in the image if not central, and the
+        directions that boards face, as seen by the person holding them.
     """
     ordered = poses[np.argsort(np.linalg.norm(poses[:, :3, 3], axis=1))]
     distance_m = np.linalg.norm(ordered[:, :3, 3], axis=1)
@@ -429,7 +428,7 @@ def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, t
 
 
 def common_third(lens: Intrinsics, centres: Array) -> str:
-    """Name the outer third of the image in which all boards are; "" for none.
+    """Name the outer third of the image that contains all boards; "" for none.
 
     Args:
         lens: of the camera.

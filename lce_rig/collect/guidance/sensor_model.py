@@ -1,4 +1,4 @@
-"""The sensors as guidance knows them: how well they measure a board, and where a person can hold one."""
+"""The sensors' models for guidance: their accuracy for a board, and the placements within reach."""
 
 from dataclasses import dataclass, field, replace
 
@@ -18,16 +18,16 @@ from lce_rig.rig import QualitySettings, Rig
 
 @dataclass(frozen=True, eq=False)
 class SensorModel:
-    """A camera and a LiDAR that look at one board.
+    """A camera and a LiDAR that see one board.
 
     Attributes:
         board: the board.
         lens: the camera.
-        elevations_rad: (L,) of the LiDAR's rings, from the lowest.
+        elevations_rad: (L,) of the LiDAR's rings, lowest first.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         pattern, width_rad: how its beams sweep the field of view, and its width; as `DataSheet` has them.
-        limits: the profile's, on what a capture must show.
-        target_sigma_rad, target_sigma_m: how well the extrinsic is to be known.
+        limits: the profile's limits for a capture.
+        target_sigma_rad, target_sigma_m: target standard deviations of the extrinsics.
         priors, levels: of the likelihood's constant errors and noise; levels are learned from captures.
         inflation: factor by which the calibration of these captures widens its covariance, as they scatter.
     """
@@ -104,9 +104,9 @@ DIAMOND_DEG = 45.0
 ROLLS_DEG = (-12.0, 0.0, 12.0)
 #: Share of the plate's height that must lie within the LiDAR's vertical field.
 SEEN_SHARE = 0.8
-# Without rings a plate that reaches out of the field of view is refused: it lies so much larger within it.
+# Scale of the plate that must lie within the field of view of a LiDAR without rings: a cut plate is refused.
 _FREE_SHARE = 1.2
-#: How far below and above the LiDAR arms hold the board's centre.
+#: Lowest and highest position of the board's centre relative to the LiDAR, m: the reach of arms.
 REACH_M = (-0.9, 0.8)
 # Free border of the image, as a share of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
@@ -117,7 +117,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 @dataclass(frozen=True, eq=False)
 class SensorPlace:
-    """Where the camera, the LiDAR and the ground are.
+    """Positions of the camera, the LiDAR and the ground.
 
     Attributes:
         model: the sensors.
@@ -149,7 +149,7 @@ class SensorPlace:
 
 
 def spread_candidates(view: SensorPlace, n_places: int) -> Array:
-    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over everything that is reachable.
+    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over the reachable space.
 
     Args:
         view: the sensors.
@@ -179,7 +179,7 @@ def spread_candidates(view: SensorPlace, n_places: int) -> Array:
 
 
 def face_camera(view: SensorPlace, rays: Array, distance_m: Array, tilt_rad: Array, roll_rad: Array) -> Array:
-    """Build T_cam_board (N, 4, 4) of boards that look at the camera, tilted and rolled.
+    """Build T_cam_board (N, 4, 4) of boards that face the camera, tilted and rolled.
 
     Args:
         view: the sensors.
@@ -187,7 +187,7 @@ def face_camera(view: SensorPlace, rays: Array, distance_m: Array, tilt_rad: Arr
         distance_m: (N,).
         tilt_rad: (N, 2) about the board's horizontal axis (to the right as the camera sees it) and about the
             axis square to it, upwards.
-        roll_rad: (N,) about its normal, 0 where its width is level.
+        roll_rad: (N,) about its normal, 0 with level width.
     """
     facing = facing_axes(view, rays)
     turns = np.concatenate([tilt_rad, np.zeros((len(tilt_rad), 1))], axis=1)

@@ -1,4 +1,4 @@
-"""What becomes of a live capture: it is written, raw streams beside it on request, then learned from."""
+"""Write live captures, and raw streams on request, and let the guidance learn from the captures."""
 
 import time
 from collections import deque
@@ -32,7 +32,7 @@ class Learning:
     """Calibrates the captures of each guide's sensors; open while its `with` block lasts."""
 
     def __init__(self, rig: Rig, guides: Sequence[Guide]) -> None:
-        """Prepare; no process is started before there are captures enough."""
+        """Prepare; the process starts once there are enough captures."""
         self._guides = guides
         self._min_captures = rig.quality.min_captures
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
@@ -49,13 +49,13 @@ class Learning:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End, without waiting for a calibration."""
+        """Stop, without waiting for a calibration."""
         self._is_open = False
         self._worker.__exit__(None, None, None)
         self._caller.shutdown(cancel_futures=True)
 
     def show(self, name: str, detection: BoardDetection) -> None:
-        """Take a capture's detection."""
+        """Add a capture's detection."""
         self._shown[name] = detection
         self._calibrate_again(detection)
 
@@ -69,7 +69,7 @@ class Learning:
                 self._due.append(k)
 
     def teach(self) -> None:
-        """Pass what was learned since the last call to its guide, and begin to learn what came since."""
+        """Pass the planner learned since the last call to its guide, and learn from newer captures."""
         if self._running is not None and self._running[1].done():
             k, learned = self._running
             self._running, planner = None, None
@@ -77,7 +77,7 @@ class Learning:
                 planner = learned.result()
             except Exception as error:  # Captures are safe even if a calibration fails.
                 self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
-            # Where captures came, or were taken back, meanwhile, it is due again.
+            # If captures were added or taken back meanwhile, this guide is due again.
             if k not in self._due:
                 self._guides[k].adopt(planner)
         if self._running is None and self._due and self._is_open:
@@ -94,7 +94,7 @@ class Learning:
                 guide.adopt(None)
 
     def notes(self) -> list[str]:
-        """Say what went wrong."""
+        """Return the problem of the last attempt to learn, if any."""
         return [self._problem] if self._problem else []
 
 
@@ -106,7 +106,7 @@ class _Teacher:
         self._guides = make_guides(rig)
 
     def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
-        """Calibrate one guide's sensors; None where more captures are needed."""
+        """Calibrate one guide's sensors; None if more captures are needed."""
         guide = self._guides[k]
         tolerances = Tolerances.of(self._rig.cameras[guide.key[0]], self._rig.board)
         settings = EstimateSettings.of(CalibrateOptions(), self._rig.lidars[guide.lidar], tolerances)
@@ -136,7 +136,7 @@ class CaptureWriter:
         self.disk: DiskWriter[Callable[[], None]] = DiskWriter(session.path, lambda step: step())
 
     def close(self) -> None:
-        """Write what was asked for.
+        """Write the pending captures, and stop.
 
         Raises:
             SessionError: a capture cannot be written.
@@ -147,11 +147,11 @@ class CaptureWriter:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a capture is not on the disk, or not taken back, yet."""
+        """Whether the writing or taking back of a capture is pending."""
         return self.disk.n_waiting > 0
 
     def keep(self, moment: CaptureMoment, events: Sequence[EventCut], meta: Mapping[str, object]) -> None:
-        """Have a capture written; returns at once.
+        """Queue a capture for writing; returns at once.
 
         Args:
             moment: the board in its frame, whose images are stored.
@@ -181,10 +181,10 @@ class CaptureWriter:
     def take(self) -> list[tuple[str, BoardDetection | None, float]]:
         """Return the captures saved or taken back since the last call, by name.
 
-        Each comes with its detection, None where it was taken back, and the time in s until it was safe.
+        Each comes with its detection, None if it was taken back, and the time in s until it was safe.
 
         Raises:
-            SessionError: one cannot be written: the disk is full, or gone.
+            SessionError: a capture cannot be written: the disk is full, or gone.
         """
         failure = self.disk.failure
         done = [self._done.popleft() for _ in range(len(self._done))]

@@ -1,8 +1,8 @@
-"""The live loop: see the board in the newest frame, say where it goes, capture it when it is there.
+"""The live loop: detect the board in the newest frame, give instructions, capture it at its placement.
 
-Threads: one reads each sensor into one queue (`AttachedSensors`), one pairs (`FrameFeed`), one writes
-captures (`CaptureWriter`); this loop alone decides and tells the views. Processes: one looks for the board
-(`BoardSearch`), one calibrates what was captured (`Learning`).
+Threads: one per sensor reads into one queue (`AttachedSensors`), one pairs (`FrameFeed`), one writes captures
+(`CaptureWriter`). This loop alone decides, and updates the views. Processes: one detects the board
+(`BoardSearch`), one calibrates from the captures (`Learning`).
 """
 
 import sys
@@ -40,10 +40,10 @@ from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
 
 _WAIT_S = 0.1
-# Threads that read sensors ask for the interpreter often and briefly, the loop holds it for long: at Python's
-# 5 ms guidance would be slower by a third.
+# Switch interval of threads: sensor threads need the interpreter often and briefly, the loop holds it for
+# long. At Python's 5 ms, guidance would be slower by a third.
 _TURN_S = 0.0005
-# A board that has not moved, as far as its pose is known.
+# Largest apparent motion of a board that has not moved.
 _SAME_M, _SAME_DEG = 0.02, 2.0
 
 
@@ -55,20 +55,20 @@ def collect_live(
     keys: Callable[[], Key | TakeBack | None] = lambda: None,
     record_to: Path | None = None,
 ) -> LiveReport:
-    """Collect from attached sensors until there is enough.
+    """Collect from attached sensors until the captures are enough.
 
     Args:
-        session: open for writing; what it holds counts.
-        sources: of every sensor, and the sync board's where there is one; not open yet.
-        options: how it goes.
+        session: open for writing; its captures count.
+        sources: of every sensor, and of the sync board if there is one; not open yet.
+        options: of the collection.
         show: receives the state after every frame, and twice a second without one; must not block.
-        keys: asked what the user wants.
-        record_to: a new folder for the raw streams; None where they are not recorded.
+        keys: returns the user's last key or request, if any.
+        record_to: a new folder for the raw streams; None to record none.
 
     Raises:
-        SourceError: a sensor cannot be opened, or the folder of the raw streams not be made.
+        SourceError: a sensor cannot be opened, or the folder for the raw streams cannot be created.
         SessionError: a capture cannot be written; those before are safe.
-        ProfileError: the profile cannot be used, such as a network of its.
+        ProfileError: the profile cannot be used, for example its network.
     """
     options = options or LiveOptions()
     rig = session.rig
@@ -76,7 +76,7 @@ def collect_live(
     guides = make_guides(rig)
     for capture in session.captures:
         count_in(capture, session, guides)
-    # Leaving closes in turn: nothing new comes, then what was decided is written.
+    # Order of closing: first no new data comes, then the pending captures are written.
     with ExitStack() as stack:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_TURN_S)
@@ -140,7 +140,7 @@ class _Loop:
         self._last: BoardDetection | None = None
 
     def run(self, show: Callable[[LiveState], None], keys: Callable[[], Key | TakeBack | None]) -> None:
-        """Go on until something ends it; what was lost until then is noted while the sensors are open."""
+        """Collect until an ending; losses are noted while the sensors are still open."""
         while True:
             frame = self._feed.take(_WAIT_S)
             self.take_kept()
@@ -228,7 +228,7 @@ class _Loop:
         self._monitor.narrate(narration, guide, present)
 
     def _decide(self, moment: CaptureMoment, narration: Narration) -> Narration:
-        """Capture a moment, unless it adds nothing."""
+        """Capture a moment if it adds information."""
         detection = moment.detection
         guide = self._seeing_guide(detection)
         if guide is None:
@@ -302,11 +302,11 @@ class _Loop:
             self._capture_by_hand(self._last)
 
     def _capture_by_hand(self, detection: BoardDetection) -> None:
-        """Capture the board as it is now, even while it moves, unless it was captured a moment ago."""
+        """Capture the board at once, even while it moves, unless it was captured a moment ago."""
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        # Of a board that was captured by itself just now the hand comes late.
+        # A keypress just after an automatic capture counts as late.
         is_recent = time.monotonic() - self._captured_s < self._options.hold_s
         places = Placements() if is_recent else Placements(_SAME_M, _SAME_DEG)
         if self._asked and places.are_alike(self._asked[-1].poses, detection.poses):
@@ -339,7 +339,7 @@ class _Loop:
             return "enough"
         if options.idle_s is None:
             return None
-        # Nothing new was shown for long, or no new placement is left.
+        # No new placement was shown for long, or none is left.
         has_nothing_left = all(guide.is_exhausted for guide in self._guides)
         patience_s = min(options.idle_s, GIVE_UP_S) if has_nothing_left else options.idle_s
         return "exhausted" if time.monotonic() - self._captured_s > patience_s else None
@@ -351,7 +351,7 @@ class _Loop:
         lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
         goes_on = ""
         if lacking and not has_ended:
-            # It goes on for the guide that needs most captures.
+            # The guide that needs most captures gives the reason.
             most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
             goes_on = (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
         return self._monitor.state(
@@ -365,7 +365,7 @@ class _Loop:
     def _active_guide(self, detection: BoardDetection) -> Guide:
         """Pick the guide to show: among those that see the board, the one that needs captures most.
 
-        Where they all have enough, the board goes before a camera whose guide has not.
+        If these all have enough, include the cameras whose guides have not.
         """
         seeing = [g for g in self._guides if g.key in detection.poses]
         if seeing and all(guide.is_enough for guide in seeing):

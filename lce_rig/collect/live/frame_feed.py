@@ -1,4 +1,4 @@
-"""Samples in, the newest frame out: paired in a thread of its own, so that slow detection stops nothing."""
+"""Pair samples into frames in a separate thread, so that slow detection delays no sensor."""
 
 import threading
 import time
@@ -38,15 +38,15 @@ class FrameFeed:
         *,
         are_events_enough: bool = False,
     ) -> None:
-        """Prepare.
+        """Prepare the feed.
 
         Args:
             rig: the profile.
             sensors: open.
-            clock: ties the timestamps.
-            board: the sync board; None where there is none.
-            record: takes every sample too, as it came but for its time; must not block.
-            are_events_enough: whether events need no image made of them.
+            clock: converts the timestamps to the rig's clock.
+            board: the sync board; None without one.
+            record: also receives every sample, unchanged except for its time; must not block.
+            are_events_enough: whether events are used without an image reconstructed from them.
         """
         self.losses = Losses()
         self._rig = rig
@@ -73,10 +73,10 @@ class FrameFeed:
         self._thread.join()
 
     def take(self, timeout_s: float) -> Frame | None:
-        """Take the newest frame; None where none came in time.
+        """Take the newest frame; None if no frame came in time.
 
         Raises:
-            LceRigError: the feed cannot go on, such as a profile's network that cannot be used.
+            LceRigError: the feed cannot continue, for example because the profile's network is unusable.
         """
         came = self._frames.take(timeout_s)
         if came is None and self._failure is not None:

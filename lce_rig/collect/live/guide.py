@@ -35,26 +35,25 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 
-#: Another placement is proposed after a board was wanted at one for so long.
+#: Time after which another placement is proposed if the board has not reached the wanted one.
 GIVE_UP_S = 30.0
-# Two LiDARs are then known to each other within 0.04 deg and 2 mm in simulations, two cameras within 0.04 deg
-# and 8 mm.
+# Captures of two sensors of one kind that are enough: in simulations, two LiDARs are then calibrated to
+# 0.04 deg and 2 mm, two cameras to 0.04 deg and 8 mm.
 _ENOUGH_OF_PEERS = 12
 
 
 class Guide:
     """Guides the board before one camera and one LiDAR.
 
-    Without a nominal extrinsic in the profile it begins when a first calibration is there; for a LiDAR whose
-    beams are not known there is no guidance at all. Nor is there for two sensors of one kind, whose captures
-    are counted.
+    Without nominal extrinsics in the profile, guidance starts after a first calibration. It is not available
+    for a LiDAR with unknown beams, nor for two sensors of one kind, whose captures are only counted.
 
     Attributes:
-        key: camera and channel in which the board is followed; the first of two LiDARs, and "".
+        key: camera and channel that follow the board; the first of two LiDARs, and "".
         lidar: name of the LiDAR, or of the second camera.
-        second: its key, or the second camera's.
+        second: key of that LiDAR or second camera.
         is_of_peers: whether both sensors are of one kind.
-        problem: why there is no guidance yet; None while there is.
+        problem: why guidance is not available yet; None while it is.
         guidance: the latest; None before the first.
     """
 
@@ -109,12 +108,12 @@ class Guide:
 
     @property
     def has_enough(self) -> bool:
-        """Whether the captures are enough as far as is known: by their number where nothing is predicted."""
+        """Whether the captures are enough: as predicted or, without a prediction, by their number."""
         return self.n_held >= self._min_captures if self._planner is None else self.is_enough
 
     @property
     def need(self) -> float:
-        """How far the captures are from enough: 1 where the target is predicted to be met."""
+        """Need of more captures: 1 if the target is just met by prediction, larger before."""
         if self.guidance is None:
             return (self._n_enough if self.is_of_peers else self._min_captures) / max(self.n_held, 0.5)
         return max(
@@ -124,21 +123,21 @@ class Guide:
 
     @property
     def why_none(self) -> str:
-        """Say why there is no guidance; "" while there is."""
+        """Reason why guidance is unavailable; "" while it is available."""
         return self.problem.sentence if self.problem else ""
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether no placement is known that would be new."""
+        """Whether no new placement is known."""
         return self.guidance is not None and self.guidance.T_cam_board is None
 
     @property
     def wanted(self) -> Array | None:
-        """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
+        """Placement wanted next, T_cam_board (4, 4); None if no reachable placement is new."""
         return None if self.guidance is None else self.guidance.T_cam_board
 
     def sees(self, detection: BoardDetection) -> bool:
-        """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
+        """Check whether both of its sensors see the board in a detection within the profile's limits."""
         seen = {(lidar, "") for lidar in detection.lidars} | (
             detection.images.keys() - detection.unfit.keys()
         )
@@ -184,13 +183,13 @@ class Guide:
         is_asked: bool = True,
         others: Sequence["Guide"] = (),
     ) -> None:
-        """Choose the next placement where none is chosen, or the last was not reached for long.
+        """Choose the next placement if none is chosen, or if the last was not reached for long.
 
         Args:
-            present: (4, 4) where the board is; None where it is not seen.
+            present: (4, 4) T_cam_board now; None if the board is not seen.
             now_s: by the sensors' clock.
-            is_asked: whether this guide is the one that is followed.
-            others: of the rig, whose sensors may see the board, too.
+            is_asked: whether the user follows this guide.
+            others: other guides of the rig, whose sensors may see the board, too.
         """
         if self._planner is None:
             return
@@ -203,14 +202,14 @@ class Guide:
         beside = [each for other in others if (each := self._beside(other)) is not None]
         guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         if guidance.T_cam_board is None and self._avoid:
-            # Obstacles may be gone: ask again rather than for nothing.
+            # Obstacles may be gone: propose unreachable placements again rather than none.
             del self._avoid[:-1]
             guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         self.guidance = guidance
         self._wanted_since_s = now_s
 
     def _beside(self, other: "Guide") -> Beside | None:
-        """Relate another guide that still needs captures, by the camera or the LiDAR that both have."""
+        """Relate another guide that still needs captures, by the common camera or LiDAR."""
         if self._planner is None or other._planner is None or other is self or other.is_enough:
             return None
         own, its = self._planner.view.T_cam_lidar, other._planner.view.T_cam_lidar
@@ -221,18 +220,18 @@ class Guide:
         return None
 
     def note_refusal(self, present: Array) -> None:
-        """Ask for another placement where a board (4, 4) was refused though it is as wanted."""
+        """Ask for another placement if a board (4, 4) was refused at the wanted one."""
         if self.is_there(present):
             self.give_up()
 
     def give_up(self) -> None:
-        """Ask for another placement: something is in the way of this one."""
+        """Ask for another placement: this one is out of reach."""
         if self.wanted is not None:
             self._avoid.append(self.wanted)
         self.guidance = None
 
     def adds_nothing(self, present: Array) -> Refusal | None:
-        """Say why a board (4, 4) need not be captured where it is; None where it adds something."""
+        """Return why a capture of the board (4, 4) is not needed; None if it adds information."""
         if self.is_of_peers:
             is_alike = find_alike(self._held_poses(), present[None], MIN_MOVE_M, np.radians(MIN_TURN_DEG))
             return CALIBRATE_SAME_PLACEMENT.refusal() if is_alike.any() else None
@@ -242,7 +241,7 @@ class Guide:
         return self._planner.adds_nothing(held, present, self._names, avoid, self.wanted)
 
     def explain(self) -> Finding | None:
-        """Find why more captures are needed, and about how many; None where there are enough."""
+        """Return why more captures are needed, and about how many; None if there are enough."""
         guidance = self.guidance
         if guidance is None or guidance.is_enough or not self._names:
             return None
@@ -257,7 +256,7 @@ class Guide:
         )
 
     def predict(self) -> Finding | None:
-        """Give the predicted standard deviations for the captures; None where nothing can be predicted."""
+        """Return the predicted standard deviations for the captures; None without a prediction."""
         if self._planner is None or not self._names:
             return None
         guidance = self.guidance or self._planner.guide(self._held_poses())
@@ -272,13 +271,13 @@ class Guide:
         )
 
     def instruct(self, present: Array) -> dict[Kind, str]:
-        """Say what to do with a board (4, 4)."""
+        """Return the moves from a board (4, 4) to the wanted placement."""
         if self._planner is None or self.wanted is None:
             return {}
         return instruct(self._planner.view, present, self.wanted)
 
     def is_there(self, present: Array) -> bool:
-        """Check whether a board (4, 4) is where it should be."""
+        """Check whether a board (4, 4) is at its wanted placement."""
         if self._planner is None or self.wanted is None:
             return False
         return is_there(self._planner.view, present, self.wanted)
@@ -289,7 +288,7 @@ class Guide:
         return None if model is None else outline_px(T_cam_board, model.board, model.lens)
 
     def coverage(self) -> Coverage | None:
-        """Measure what the captures have shown."""
+        """Measure the coverage of the reachable placements by the captures."""
         if self._coverage is None and self._planner is not None:
             held, reachable = self._held_poses(), self._planner.candidates
             self._coverage = measure_coverage(self._planner.view, held, reachable)
@@ -327,7 +326,7 @@ def predict(session: Session) -> list[Finding]:
 
 
 def make_guides(rig: Rig) -> list[Guide]:
-    """Make a guide for every camera with every LiDAR: by its frames where it has any.
+    """Make a guide for every camera with every LiDAR: on its frames channel if it has one.
 
     In a rig of one kind of sensor, make one for the first with each other.
     """
@@ -339,7 +338,7 @@ def make_guides(rig: Rig) -> list[Guide]:
 
 
 def _channel_of(rig: Rig, sensor: str) -> str:
-    """Name the channel in which a camera shows the board, its frames where it has any; "" for a LiDAR."""
+    """Name the channel of a camera that shows the board, its frames channel if it has one; "" for a LiDAR."""
     if sensor in rig.lidars:
         return ""
     camera = rig.cameras[sensor]
@@ -353,7 +352,7 @@ _ELSEWHERE = "hold it somewhere else, tilted otherwise"
 
 @dataclass(frozen=True)
 class Narration:
-    """One moment in words.
+    """The message for one moment.
 
     Attributes:
         phase, headline, detail, hold_s: as `LiveState`.
@@ -366,11 +365,11 @@ class Narration:
 
 
 def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
-    """Say what keeps a board out of sight.
+    """Explain why the board is not seen.
 
     Args:
-        detection: in which a sensor of the guide does not see the board, or not well enough.
-        guide: whose sensors they are.
+        detection: a sensor of the guide does not see the board in it, or not well enough.
+        guide: the guide of these sensors.
         reasons: the last refusal of each stream, by its name.
     """
     lidar = guide.lidar
@@ -379,7 +378,7 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
     for key in (each for each in (guide.key, guide.second) if each[1]):
         if key not in detection.images:
             why = reasons.get(".".join(key))
-            # An image without a board hardly tells why; one with half a board does.
+            # The reason is useful only if part of the board was seen.
             headline = f"show the board to {key[0]}" if detection.images else _SHOW
             return Narration("searching", headline, why.sentence if why else "")
         if key in detection.unfit:
@@ -392,19 +391,19 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
 
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
-    """Say why a board is not captured where it is, and where it goes instead."""
+    """Explain why the board is not captured at its present place, and give the next move."""
     return Narration("refused", _next(guide, present, refusal.advice), f"not here: {refusal.text}")
 
 
 def _next(guide: Guide, present: Array, otherwise: str) -> str:
-    """Say how to go on to the wanted placement; something else where the board is there, or none is known."""
+    """Return the next instruction; the fallback if the board is there or no placement is planned."""
     if guide.wanted is None:
         return _ELSEWHERE if guide.guidance is None else otherwise
     instructions = guide.instruct(present)
     return say(instructions) if instructions else otherwise
 
 
-#: A live moment waits for a better one of its place no longer than this.
+#: Longest time for which a live moment waits for a better one of its place.
 LIVE_PATIENCE_S = 0.7
 
 
@@ -425,7 +424,7 @@ class StillBoards:
         self._refusal: Refusal | None = None
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection; a board that is moved on before its time is not captured."""
+        """Take the next detection; a board that is moved too early is not captured."""
         moments = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
             self._is_judged = self.is_decided = False
@@ -436,9 +435,9 @@ class StillBoards:
         return moments
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
-        """Say what to do with a board that is seen at (4, 4)."""
+        """Return the instruction for a board seen at (4, 4)."""
         held_s = self._gate.held_s
-        # Weighing a placement takes long: once a stretch of stillness is enough.
+        # Judging a placement is slow: do it once per period of stillness.
         if held_s is not None and not self._is_judged:
             self._is_judged, self._refusal = True, guide.adds_nothing(present)
             if self._refusal is not None:
@@ -451,7 +450,7 @@ class StillBoards:
 
 
 class SlowBoards:
-    """Captures boards that move slowly before a camera of events, where none is `taken` yet."""
+    """Captures boards that move slowly before an event camera, at placements not yet in `taken`."""
 
     def __init__(self, rig: Rig, taken: Placements) -> None:
         self._gate = MotionGate(rig, taken, Losses(), LIVE_PATIENCE_S)
@@ -461,7 +460,7 @@ class SlowBoards:
         return self._gate.take(detection)
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
-        """Say what to do with a board that is seen at (4, 4)."""
+        """Return the instruction for a board seen at (4, 4)."""
         headline, judged = _next(guide, present, _MOVE), self._gate.judged
         if isinstance(judged, Refusal):
             return Narration("moving", headline, judged.sentence)

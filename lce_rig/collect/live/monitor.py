@@ -1,4 +1,4 @@
-"""Gathers the states that views show."""
+"""The states that views show."""
 
 import time
 from collections import deque
@@ -20,19 +20,19 @@ _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
 _MET, _COUNTED = "the target is predicted to be met", "enough placements"
 _WAIT = "waiting for the sensors"
-# Without a frame for so long, the last detection is out of date.
+# Age at which the last detection is out of date.
 _STALE_S = 2.0
 
 
 class Monitor:
-    """Remembers the latest of everything.
+    """Keeps the latest detection, sensor states and messages for the views.
 
     Attributes:
         reasons: why the board is not seen, by the stream's name.
     """
 
     def __init__(self, session: Session, options: LiveOptions, feed: FrameFeed) -> None:
-        """Begin with nothing seen."""
+        """Begin without a detection."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
         self._options = options
@@ -104,7 +104,7 @@ class Monitor:
         self._log.append(f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d} {text}")
 
     def last_words(self) -> str:
-        """Repeat what was said last, for a report."""
+        """Return the last narration, for a report."""
         said = self._narration
         return f"last said: {said.headline}" + (f" ({said.detail})" if said.detail else "")
 
@@ -115,7 +115,7 @@ class Monitor:
     def state(
         self, n_captures: int, *, is_enough: bool, has_ended: bool, last_capture: str = "", goes_on: str = ""
     ) -> LiveState:
-        """Give everything as it is now."""
+        """Return the present state of the collection."""
         self._told_s = now_s = time.monotonic()
         self._watch_sensors()
         if is_enough and not self._was_enough:
@@ -125,7 +125,7 @@ class Monitor:
             self._was_enough = True
         phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
         rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
-        # Before the first capture there is nothing but wide priors.
+        # Before the first capture the figures are those of the wide priors.
         guidance = guidance if guidance is not None and guidance.n_captures else None
         return LiveState(
             rig=rig.name,
@@ -170,7 +170,7 @@ class Monitor:
         return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 
     def _watch_sensors(self) -> None:
-        """Ask how sensors do, and log those that go and come back."""
+        """Update the states of sensors, and log those that are lost or back."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
             self._asked_s = time.monotonic()
             self._statuses = self._sensors.statuses()
@@ -186,7 +186,7 @@ class Monitor:
         return self._detection is not None and time.monotonic() - self._seen_s > _STALE_S
 
     def _streams(self) -> tuple[StreamState, ...]:
-        """List every stream: channels of cameras, LiDARs, then what else there is."""
+        """List every stream: channels of cameras, LiDARs, then other sources."""
         rig, streams = self._session.rig, []
         detection = None if self._is_stale() else self._detection
         images = [] if detection is None else [(i.sensor, i.channel) for i in detection.frame.images]
@@ -215,7 +215,7 @@ class Monitor:
         return (*streams, *(self._stream(each.sensor, each, each.rate_hz, None) for each in others))
 
     def _stream(self, name: str, status: SourceStatus, rate_hz: float, figures: str | None) -> StreamState:
-        """Describe a stream; figures of its board are "" where it is not seen, None where not looked for."""
+        """Describe a stream; figures of its board are "" if it is not seen, None if not searched for."""
         lost = self._sensors.lost().get(status.sensor)
         reason = "" if lost is None else f"lost: {lost[0].what}"
         if figures == "" and not reason:

@@ -1,8 +1,8 @@
-"""The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
+"""The simulated rig in real time: its sensors as live sources, and a person following the guidance.
 
-The simulation runs in a process of its own, as sensors do. While the board is held, its scene is rendered
-once and measured again for each image and scan; on its way it is rendered every time. Where the computer
-is too slow for that, all runs in slow motion: sensors, timestamps and person keep one simulated time.
+The simulation runs in its own process, as real sensors do. While the board is held still, its scene is
+rendered once, and measured again for each image and scan; while it moves, it is rendered every time. If the
+computer is too slow, all runs in slow motion: sensors, timestamps and person share one simulated time.
 """
 
 import math
@@ -31,12 +31,12 @@ from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.placements import between
 from lce_rig.simulate.stage import require_lidar
 
-# How people behave: they react, walk, and try again where nothing happens.
+# A person's reaction time, walking speed, time until another attempt, and tries per fraction of the way.
 REACTION_S = 0.7
 WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
-# Where something is in the way they go as far as they can.
+# Fractions of the way, tried in turn while an obstacle blocks it.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
@@ -62,18 +62,18 @@ class SimulatedSource(LiveSource):
         self._taken = Inbox()
 
     def read(self) -> list[Image | Scan]:
-        """Give what the simulation has put; see `LiveSource`."""
+        """Return the samples that the simulation has sent; see `LiveSource`."""
         came = self._taken.take(_WAIT_S)
         if came is None and self._failure is not None:
             raise self._failure
         return [] if came is None else [came[1]]
 
     def close(self) -> None:
-        """End."""
+        """Stop."""
         self._taken.close()
 
     def describe(self) -> SourceStatus:
-        """Say how the sensor does."""
+        """Report the state of the sensor."""
         clock, n_lost = CLOCK_SIMULATED(), self._taken.n_dropped[self.sensor]
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, device="simulated")
 
@@ -82,7 +82,7 @@ class SimulatedSource(LiveSource):
         self._taken.put(self.sensor, [sample], _N_SLOTS)
 
     def fail(self, error: SourceError) -> None:
-        """End for good."""
+        """Stop with an error."""
         self._failure = error
         self._taken.close()
 
@@ -113,7 +113,7 @@ class SimulatedRig:
             )
         self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
         self.sources: list[LiveSource] = list(self._by_sensor.values())
-        # People see the rig as its drawing has it: they do not know the true extrinsics.
+        # The person follows the nominal extrinsics, not the true ones.
         lidar = next(iter(rig.lidars))
         views = {name: SensorPlace.nominal(rig, name, lidar) for name in framed}
         self._worker = Worker("simulated rig", _Simulation, rig, seed, views)
@@ -146,7 +146,7 @@ class SimulatedRig:
         self._reader.join()
 
     def watch(self, state: LiveState) -> None:
-        """Let the person see a state of the collection: where the board is wanted, and what was captured."""
+        """Show the person a state of the collection: the wanted placement, and the number of captures."""
         place = state.drawing.wanted if state.drawing is not None else None
         if state.phase in ("holding", "saving") or (self._is_guided and place is None):
             return
@@ -188,7 +188,7 @@ class _Simulation:
         self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
 
     def take(self, asked: tuple[str, Array] | Literal["elsewhere"] | None) -> list[Image | Scan]:
-        """Tell the person a camera and T_cam_board (4, 4), or to move on; take a sample of each sensor."""
+        """Send the person to a camera's T_cam_board (4, 4), or elsewhere; take a sample of each sensor."""
         time.sleep(max(0.0, self._due_s - time.monotonic()))
         if asked == "elsewhere":
             self._walker.set_out(self._walker.choose(), self._stamp_ns * 1e-9)
@@ -197,7 +197,7 @@ class _Simulation:
         self._walker.walk(self._stamp_ns * 1e-9)
         samples = list(self._scene.take(self._stamp_ns))
         self._stamp_ns += self._period_ns
-        # Late is late: a turn that took long is not made up for by short ones.
+        # The delay of a slow turn is not made up for by shorter ones.
         self._due_s = max(self._due_s + self._period_ns * 1e-9, time.monotonic())
         return samples
 
@@ -214,12 +214,12 @@ _FIGURE = {
 
 @dataclass(frozen=True)
 class Person:
-    """A simulated person who follows instructions, more or less.
+    """A simulated person; follows instructions with errors.
 
     Attributes:
         place_sigma_m: error along each axis.
         turn_sigma_deg: error about each axis.
-        ignored_share: how often one of the instructions is not followed.
+        ignored_share: probability that one of the instructions is ignored.
     """
 
     place_sigma_m: float = 0.10
@@ -227,7 +227,7 @@ class Person:
     ignored_share: float = 0.2
 
     def follow(self, view: SensorPlace, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
-        """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
+        """Move a board T_cam_board (4, 4) to the wanted pose (4, 4), with the person's errors."""
         aim = describe_pose(view, wanted)
         instructions = instruct(view, present, wanted)
         if instructions and rng.random() < self.ignored_share:
@@ -240,7 +240,7 @@ class Person:
 
 
 class Walker:
-    """Carries the board to where it is wanted, as far as the room lets it."""
+    """Carries the board to the wanted placement, as far as the room allows."""
 
     def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, SensorPlace]) -> None:
         self._scene = scene
@@ -264,7 +264,7 @@ class Walker:
         """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.
 
         Args:
-            camera: by which it is wanted.
+            camera: whose placement it is.
             wanted: (4, 4).
             now_s: simulated time.
         """
@@ -278,7 +278,7 @@ class Walker:
                 return
 
     def walk(self, now_s: float) -> None:
-        """Go on."""
+        """Move the board to its place on the way at a time."""
         if self._way is None:
             return
         start, end, from_s, until_s = self._way

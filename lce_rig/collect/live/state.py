@@ -30,21 +30,21 @@ class TakeBack:
     name: str = ""
 
 
-#: How long a board stands still before it is captured, beyond the first half second.
+#: Time for which a board stands still before its capture, beyond the first half second.
 HOLD_S = 1.5
 
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """How a live collection goes.
+    """Options of a live collection.
 
     Attributes:
-        n_wanted: captures that the session is to hold; None until the target is predicted to be met.
-        timeout_s: ends after so long; None never.
-        hold_s: how long a board stands still before it is captured, beyond the first half second.
-        lost_s: how long a lost sensor is waited for.
-        goes_on: whether to go on when the target is met, until asked to stop.
-        idle_s: ends after so long without a capture, for unattended runs; None never.
+        n_wanted: number of captures in the session at which to end; None to end at the target accuracy.
+        timeout_s: longest duration; None without limit.
+        hold_s: time for which a board stands still before its capture, beyond the first half second.
+        lost_s: time to wait for a lost sensor.
+        goes_on: whether to continue after the target is met, until asked to stop.
+        idle_s: longest time without a capture, for unattended runs; None without limit.
     """
 
     n_wanted: int | None = None
@@ -56,27 +56,27 @@ class LiveOptions:
 
     @property
     def is_open(self) -> bool:
-        """Whether to go on when the target is predicted to be met."""
+        """Whether to continue once the target is predicted to be met."""
         return self.goes_on or self.n_wanted is not None
 
 
 @dataclass
 class LiveReport:
-    """How a live collection went.
+    """Outcome of a live collection.
 
     Attributes:
-        ending: why it ended.
+        ending: cause of its end.
         is_enough: whether the session holds enough for the profile's target, as far as is known.
         captured: names of the new captures, in order, without those taken back.
         taken_back: names of the captures that were taken back, in order.
-        latencies_s: from each decision until its capture was safe on the disk.
-        n_frames: frames looked at.
+        latencies_s: time from each decision until its capture was safe on the disk.
+        n_frames: frames processed.
         n_lost: samples lost or dropped, by sensor.
-        error: the sensor that is lost for good; None where none is.
-        notes: what else was odd.
-        predicted: the predicted standard deviations, for each camera and LiDAR of which they are known.
-        n_recorded: samples of the raw streams on the disk; None where they were not recorded.
-        recording_error: why the recording ended before the collection; None where it did not.
+        error: the sensor that is lost for good; None if all are there.
+        notes: other remarks.
+        predicted: the predicted standard deviations, for each camera and LiDAR with a prediction.
+        n_recorded: samples of the raw streams on the disk; None if they were not recorded.
+        recording_error: why the recording ended before the collection; None if it did not.
     """
 
     ending: Ending = "stopped"
@@ -102,15 +102,15 @@ Sound = Literal["tick", "captured", "taken_back", "refused", "enough", "lost"]
 
 
 class StreamState(NamedTuple):
-    """How one stream does, and whether the board is seen in it.
+    """State of one stream, and whether the board is seen in it.
 
     Attributes:
         name: "cam.frames", "lidar".
-        rate_hz: samples a second.
+        rate_hz: samples per second.
         n_lost: samples lost or dropped.
-        sees_board: None where it was not looked for.
-        reason: why not, or what is wrong with the sensor, and what to do; "" while all is well.
-        figures: in few words: "2 rings, 3.1 m", "0.05 px".
+        sees_board: None if no search was made.
+        reason: why the board is not seen, or the sensor's fault, with the action; "" while all is well.
+        figures: short values of the detection: "2 rings, 3.1 m", "0.05 px".
     """
 
     name: str
@@ -134,15 +134,15 @@ class Cue(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """The camera's last image, and where the board is and should be in it.
+    """The camera's last image, with the present and the wanted outline of the board.
 
     Attributes:
-        camera: the stream it comes from.
+        camera: name of the stream.
         pixels: (H, W) or (H, W, 3) BGR uint8.
-        present_px: (K, 2) closed outline of the board; None where it is not seen.
-        wanted_px: (K, 2) closed outline of the placement wanted next; None where there is none. Points out of
-            the lens's field of view are NaN.
-        is_there: whether the board is where it should be.
+        present_px: (K, 2) closed outline of the board; None if it is not seen.
+        wanted_px: (K, 2) closed outline of the placement wanted next; None without one. Points outside the
+            lens's field of view are NaN.
+        is_there: whether the board is at the wanted placement.
         present, wanted: (4, 4) T_cam_board of both; None like their outlines.
     """
 
@@ -160,23 +160,23 @@ class LiveState(NamedTuple):
 
     Attributes:
         rig, session: the profile's name and the session's folder.
-        elapsed_s: since the collection began.
-        phase: what goes on.
+        elapsed_s: time since the start of the collection.
+        phase: of the collection.
         headline: the one thing to do, large: "one step left, 0.5 m closer".
-        detail: why, or what goes on, smaller; "" where there is nothing to add.
-        hold_s: how long the board has still to be held; None unless it is being held.
+        detail: reason or progress, smaller; "" without either.
+        hold_s: time that the board must still be held; None unless it is being held.
         n_captures: in the session.
-        n_wanted: how many are wanted; None where the target decides.
-        goes_on: about how many more captures are needed, and why; "" where there are enough.
-        last_capture: name of the capture that would be taken back; "" where there is none.
+        n_wanted: target number of captures; None if the target accuracy decides.
+        goes_on: approximate number of further captures, and why; "" if there are enough.
+        last_capture: name of the capture that would be taken back; "" without one.
         streams: every stream.
-        drawing: the guiding camera's image; None before one has come.
-        coverage: how much of what is reachable has been shown; None without guidance.
-        sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN where captures are few.
+        drawing: the guiding camera's image; None before the first.
+        coverage: of the reachable placements by the captures; None without guidance.
+        sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN with few captures.
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
-        notes: what holds all the time, in words.
+        notes: lasting remarks, in words.
         requires_still_boards: whether boards must stand still, as `SyncVerdict` says.
         n_logged: messages since the beginning, of which `log` holds the latest.
     """
