@@ -85,7 +85,7 @@ class ExportJob:
         return build_trees(self.calibrations, self.rig, self.robot)
 
     def name_of(self, calibration: Calibration) -> str:
-        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too where there are several."""
+        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too in a rig of several."""
         both = f"{calibration.camera}_{calibration.lidar}"
         return both if len(self.rig.lidars) > 1 else calibration.camera
 

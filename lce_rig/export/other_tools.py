@@ -42,14 +42,14 @@ _LIVO2_MODELS = {"radtan": "Pinhole", "equidistant": "EquidistantCamera"}
 
 
 def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
-    """Find the model with fewer coefficients that draws the whole image as another does.
+    """Fit a model with fewer coefficients to given intrinsics over the whole image.
 
     Args:
-        given: the other; one that needs no more coefficients is returned as it is, filled with zeros.
-        name: "radtan4" or "radtan5"; a fisheye stays one.
+        given: the intrinsics; with no more coefficients than the model, they are only padded with zeros.
+        name: "radtan4" or "radtan5"; a fisheye stays a fisheye.
 
     Returns:
-        The model, and its distance from the other over the image, px, rms and at most; 0 if it is the same.
+        The fit, and its distance from the given ones over the image, px, rms and maximum; 0 if it is the same.
     """
     model = MODELS[name if given.model == "radtan" else "equidistant"]
     n = len(model.coefficients)
@@ -321,7 +321,7 @@ def _below_kit(tree: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
     if bodies.intersection(between):
         return None
     key = [frame, *between][-1]
-    # What lies between is the sensor's description, which stays as the robot has it.
+    # The frames in between are the sensor's own description, which the robot keeps unchanged.
     return _Entry(key, frame, job.robot.find_pose(key, frame))
 
 

@@ -1,4 +1,4 @@
-"""Find sessions and recordings below a root, with what a manifest says of them."""
+"""Find sessions and recordings below a root, with their entries in a manifest."""
 
 import hashlib
 import re
@@ -35,7 +35,7 @@ class Job:
 
 
 class Entry(BaseModel):
-    """One entry of a manifest: what is known of the sessions and recordings that match a pattern."""
+    """One entry of a manifest: robot and rig of the sessions and recordings that match a pattern."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
 
@@ -79,7 +79,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     Without one, every session is taken.
 
     Args:
-        root: where they lie.
+        root: folder of the sessions and recordings.
         manifest: the manifest.
 
     Raises:
@@ -123,7 +123,7 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
-    """Find what the entries name; the first entry that matches a path counts.
+    """Find the paths that the entries name; the first entry that matches a path counts.
 
     Raises:
         ProfileError: an entry's profile does not exist; its path starts at the manifest's folder.

@@ -1,8 +1,8 @@
 """The registry: a folder of each session's result, and the table of them all.
 
 The table has a row for each camera and LiDAR of a session, or for a session that failed. It is an index: a
-folder of the registry holds result.json, and beside it `ROWS` with what result.json does not hold: `SESSION`.
-`PAIR` selects the other columns from result.json, here and nowhere else.
+folder of the registry holds result.json, and beside it `ROWS` with the columns that result.json lacks:
+`SESSION`. `PAIR` selects the other columns from result.json, here and nowhere else.
 """
 
 import io
@@ -157,7 +157,7 @@ def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None
         columns: the names of those to read; None for all.
 
     Raises:
-        SessionError: there is no such file, or it is not such a table.
+            SessionError: the file is missing, or not such a table.
     """
     place = place if isinstance(place, Storage) else Storage.at(place)
     names = list(SCHEMA.names if columns is None else columns)
@@ -279,7 +279,7 @@ class Registry:
         return f"{robot}/{names[-1]}" if names else None
 
     def rows(self, folder: str) -> list[Row]:
-        """Read the rows of one result: none if it is no result, one with a cause if its files are damaged."""
+        """Read the rows of one result: none without a result, one with a cause if its files are damaged."""
         place = self.place / folder
         robot, _, name = folder.partition("/")
         names = {"robot": robot, "folder": folder}
@@ -315,7 +315,7 @@ class Registry:
                 "list_contains(findings, 'verdict.moved')"; "" for all rows.
 
         Raises:
-            SessionError: there is no table, or it cannot be read.
+            SessionError: the table is missing, or cannot be read.
             UsageError: the condition or a column is wrong; the columns are named.
         """
         names = list(columns or SCHEMA.names)

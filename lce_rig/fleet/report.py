@@ -158,7 +158,7 @@ class FleetReport:
         n_rows: of its table.
         history: results compared in time.
         findings: robots that moved.
-        verdicts: (verdict, or status of what has no result), rows and robots, the most rows first.
+        verdicts: (verdict, or status of a session without result), rows and robots, the most rows first.
         causes: (severity, code) of missing, failed and marginal results, rows and robots, likewise.
     """
 

@@ -117,11 +117,11 @@ def roll_out(
         registry: with the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
         file: that lists targets.
-        wanted: as `newest_results` gives them.
+        wanted: from `newest_results`.
         progress: called with (done, total) robots.
 
     Raises:
-        UsageError: there is no target of this name.
+        UsageError: the target is unknown.
         ProfileError: the file with the targets is invalid.
     """
     targets = read_targets(file)

@@ -21,8 +21,8 @@ _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 class Storage:
     """A folder or file, by a path or by an address that fsspec knows.
 
-    All methods raise SourceError with one line if the place cannot be reached, for whatever reason a library
-    gives: missing credentials, no network, no permission.
+    All methods raise SourceError with one line if the place cannot be reached, for any reason that a library
+    reports: missing credentials, no network, no permission.
 
     Attributes:
         url: absolute; without a slash at its end.
@@ -105,7 +105,7 @@ class Storage:
             fs.pipe_file(path, content)
 
     def names(self) -> list[str]:
-        """List what it holds as a folder, by name; nothing if there is no such folder."""
+        """List the names of a folder's entries, sorted; empty if the folder is missing."""
         try:
             with self.reached() as (fs, path):
                 entries = fs.ls(path, detail=False, **({} if self.local is not None else {"refresh": True}))

@@ -41,10 +41,10 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
     A laser mounted h above the origin of the frame and inclined by alpha draws the line
     z = rho tan(alpha) + h over the distance rho from the vertical axis. The lines are found as peaks of
     elevation among the far points, where h (11 mm at most on a VLP-16) hardly bends them, and refitted with
-    all points; what no line explains is searched again, for lasers that see little or only what is near.
+    all points. The points left over are searched again, for lasers with few points or near points only.
 
     Args:
-        points_lidar: (N, 3) m, frame lidar (z along the axis of rotation); NaN where there is no return.
+        points_lidar: (N, 3) m, frame lidar (z along the axis of rotation); NaN for a missing return.
 
     Returns:
         (N,) int16; -1 where the point is not finite or lies at the origin.
@@ -138,7 +138,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
     return lines
 
 
-# NaN and values beyond a type's range are checked where they matter.
+# NaN and values beyond a type's range are checked at the places that use them.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
@@ -154,11 +154,11 @@ def to_scan(
     Args:
         cloud: structured (N,) with at least x, y, z in m, frame lidar.
         lidar: the LiDAR's name in the profile.
-        settings: its settings; `timestamps.reference` says which firing `stamp_ns` marks.
+        settings: its settings; `timestamps.reference` names the firing that `stamp_ns` marks.
         where: file or topic, for messages.
-        stamp_ns: the point cloud's timestamp as recorded; None where there is none.
+        stamp_ns: the point cloud's timestamp as recorded, or None.
         host_ns: arrival at the host.
-        notes: receives what the point cloud lacks or how it was understood, in words.
+        notes: receives the missing fields and the assumptions made, in words.
 
     Returns:
         The points with a return: finite, neither at the origin nor above or below it, and not nearer than
@@ -266,7 +266,7 @@ def _ring(
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
     is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
     # Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
-    # points may swap their mean elevations, which is no reason to renumber: Spearman's correlation decides.
+    # points may swap their mean elevations; they keep their numbers if Spearman's correlation is high.
     rises = bool((np.diff(rank) > 0).all())
     if len(rank) >= 3:
         rises = bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
@@ -289,7 +289,7 @@ def _refuse_other_frame(points: NDArray[np.float32], ring: NDArray[np.int16], wh
 
 
 def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[str]) -> NDArray[np.int16]:
-    """Number the rings by elevation, because of a cause; say both in the error where there are none."""
+    """Number the rings by elevation; without rings, raise a SourceError that includes the cause."""
     try:
         ring = rings_from_elevation(points)
     except SourceError as error:
@@ -301,10 +301,10 @@ def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[st
 def _ring_thickness_deg(
     ring: NDArray[np.intp], elevation: NDArray[np.float64], points: NDArray[np.float32]
 ) -> float:
-    """Compute the scatter of elevation of one ring in one direction: the median standard deviation, deg.
+    """Compute the median standard deviation of the elevation of one ring in one direction, deg.
 
-    Directions are told apart because a cloud in another frame may be tilted; the median because near
-    returns show where in the sensor a beam begins.
+    Each direction counts separately because a point cloud in another frame may be tilted. The median is used
+    because near returns are shifted by the beam's offset inside the sensor.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     cell = ring * _N_DIRECTIONS + ((azimuth / (2 * np.pi) + 0.5) * (_N_DIRECTIONS - 1)).astype(np.intp)
@@ -353,7 +353,7 @@ def _times(
 
 
 def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
-    """Bring a time field to integers or float64; None where it is constant, not finite or rounded away."""
+    """Convert a time field to integers or float64; None if it is constant, not finite or rounded away."""
     if values.dtype.kind in "iu":
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
@@ -367,7 +367,7 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _unit(ticks: NDArray[Any]) -> str | None:
-    """Return the unit from how long the scan lasts; None where it lasts longer than any, in any unit."""
+    """Return the unit that fits the scan's duration; None if the duration is too long in every unit."""
     span = float(ticks.max()) - float(ticks.min())
     for unit, scale in NS_PER_UNIT.items():
         if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:

@@ -48,7 +48,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     """Decode a PNG, JPEG or other image file held in memory.
 
     Raises:
-        ValueError: what is wrong with it.
+        ValueError: the data are damaged or not an image; the text has the reason.
     """
     import cv2
 

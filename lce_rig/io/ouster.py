@@ -178,7 +178,7 @@ class OusterRecording:
         """Find the metadata and the sensor's packets.
 
         Raises:
-            SourceError: there are no metadata, of a profile that is not read, or no packets that fit them.
+            SourceError: the metadata are missing or of an unsupported profile, or no packet fits them.
         """
         self.path = path
         self.notes: list[str] = []

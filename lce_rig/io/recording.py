@@ -36,10 +36,10 @@ class SourceOptions:
     """Options for reading a recording; they override the profile.
 
     Attributes:
-        camera, channel, lidar: of a folder's images and point clouds; None takes the rig's first channel and
-            LiDAR, and its camera where it has one only or folders are named after them.
+        camera, channel, lidar: sensors of a folder's images and point clouds; None takes the rig's first
+            channel and LiDAR, and the camera from folders' names or the rig's only camera.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
-        is_part: whether other recordings of the same moment hold what this one lacks.
+        is_part: whether other recordings of the same moment hold the sensors missing here.
     """
 
     camera: str | None = None
@@ -53,8 +53,8 @@ class Recording(Protocol):
     """Anything recorded.
 
     Attributes:
-        path: where it lies.
-        notes: what was chosen, assumed or missing, in words; grows while it is read.
+        path: file or folder.
+        notes: choices, assumptions and missing data, in words; grows while it is read.
     """
 
     path: Path
@@ -68,7 +68,7 @@ class ContinuousRecording(Recording, Protocol):
     Attributes:
         key: fingerprint of the recording.
         n_samples: number of images and scans to come, for progress.
-        streams: what is in it.
+        streams: the sensor channels in it.
     """
 
     key: str
@@ -76,12 +76,12 @@ class ContinuousRecording(Recording, Protocol):
     streams: Set[Stream]
 
     def samples(self) -> Iterator[Sample]:
-        """Yield what the sensors saw, in order of time; events in packets."""
+        """Yield images, scans and event packets, in order of time."""
         ...
 
 
 def serials_of(recording: Recording) -> dict[str, str]:
-    """Give the serial numbers of sensors that a recording tells, by sensor; most tell none.
+    """Return the serial numbers in a recording, by sensor; empty for most recordings.
 
     A reader that knows them has an attribute `serials`.
     """
@@ -107,9 +107,9 @@ def choose_camera(
 
     Args:
         rig: the profile.
-        options: what was asked for.
-        notes: takes what was chosen.
-        camera: that the folder itself names; None where it does not.
+        options: the user's choice.
+        notes: receives the choice, in words.
+        camera: camera named by the folder itself, or None.
 
     Raises:
         SourceError: the rig has no such camera or channel, or several cameras and none was named.
@@ -296,8 +296,8 @@ def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: 
 def join_recordings(recordings: Sequence[Recording], rig: Rig) -> list[Recording]:
     """Join continuous recordings of the same moment, in the order given.
 
-    A recording is of the same moment as those before it where it repeats no LiDAR, and adds a sensor or no
-    lone LiDAR follows that it could belong to; what else it repeats is skipped.
+    A recording belongs to those before it if it repeats no LiDAR, and either adds a sensor or no later
+    recording holds only a LiDAR. Other repeated sensors are skipped.
     """
     groups: list[list[Recording]] = []
     for place, recording in enumerate(recordings):
@@ -359,7 +359,7 @@ class JoinedRecording:
 
     Attributes:
         path: of the first.
-        notes: those of all, and what was skipped.
+        notes: those of all, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.

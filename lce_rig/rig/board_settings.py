@@ -21,7 +21,7 @@ KEYS_OF_TYPE: dict[BoardType, tuple[str, ...]] = {
     "aprilgrid": ("tags", "tag_spacing"),
     "plain": (),
 }
-# Corners by the parts that the profile counts: factor, and what is added.
+# Corners per axis from the profile's number of parts: factor, and number added.
 _CORNERS_OF_TYPE: dict[BoardType, tuple[int, int]] = {
     "checkerboard": (1, 0),
     "charuco": (1, -1),

@@ -1,6 +1,6 @@
 """Edits of a profile's text that keep comments and layout.
 
-PyYAML's marks tell where a key's text begins and ends. ruamel.yaml would keep comments, too, but it ties each
+PyYAML's marks give the start and end of a key's text. ruamel.yaml would keep comments, too, but it ties each
 comment to the key above it: a key added to or removed from a block takes the next block's comments along.
 """
 
@@ -56,7 +56,7 @@ def edit_text(text: str, settings: Sequence[tuple[str, str]], source: str) -> st
 
 
 def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[str, str]]:
-    """List what `edit_text` sets for a camera's lens.
+    """List the keys and values that `edit_text` sets for a camera's intrinsics.
 
     Args:
         camera: its name.

@@ -332,10 +332,10 @@ class Rig(Settings):
         return self
 
     def of_robot(self, name: str | None) -> "Rig":
-        """Name the robot that carries this very rig; None leaves it as it is.
+        """Return the rig with the name of the robot that carries it; None changes nothing.
 
         Raises:
-            UsageError: the profile names another one, or it cannot be a name.
+            UsageError: the profile names another robot, or the name is invalid.
         """
         if name is None or name == self.robot:
             return self

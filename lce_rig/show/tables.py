@@ -17,7 +17,7 @@ Row = Sequence[str]
 _STEP = 1e-6
 _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _SCENE = {"agrees": "agree with the extrinsics", "contradicts": "contradict the extrinsics"}
-# Along such an axis there is no best fit, and so no change that would have been seen.
+# Reasons of an axis without a best fit, and so without a smallest visible change.
 _WITHOUT_FIT = ("scene.flat", "scene.no_peak")
 
 
@@ -157,7 +157,7 @@ _FIGURES = ("planes", "edges", "held out", "corners")
 
 
 def _capture_rows(c: Calibration) -> list[Row]:
-    """List the residuals of each capture, "" where there is none."""
+    """List the residuals of each capture; "" for an unknown one."""
     rows: list[Row] = []
     for r in c.residuals:
         sizes_m = (r.plane_mean_m, r.edge_mean_m, r.held_out_m)
@@ -167,7 +167,7 @@ def _capture_rows(c: Calibration) -> list[Row]:
 
 
 def _channel_rows(c: Calibration) -> list[Row]:
-    """List figures of the channels, a column each; none where one channel saw still boards."""
+    """List figures of the channels, a column each; empty for a single channel that saw still boards."""
     if len(c.channel_results) < 2 and all(r.time_offset_s is None for r in c.channel_results):
         return []
     offsets = [
@@ -190,7 +190,7 @@ def scene_words(opinion: SceneOpinion) -> str:
 
 
 def axis_table(title: str, axes: Sequence[AxisDrift]) -> Table:
-    """State for each axis whether it changed, by how much, and the smallest change that would be seen."""
+    """Return a table of each axis: its state, its change, and the smallest change that would be seen."""
     rows = []
     for axis in axes:
         scale, digits, kind = (1.0, 2, "about") if axis.unit == "deg" else (1000.0, 0, "along")

@@ -138,8 +138,8 @@ def place_board(
         room: the board and its carrier must stand free in it.
         options: ranges of distance and roll.
         index: of the capture; consecutive ones fill the image evenly.
-        rng: source of the tilt and of what is tried next.
-        start: (3,) where the session's even filling begins, 0..1.
+        rng: source of the tilt and of the next candidates.
+        start: (3,) start of the session's even filling, 0..1.
 
     Raises:
         LceRigError: no placement is visible to both the camera and the LiDAR.
@@ -282,7 +282,7 @@ def hold_board(T_world_board: Array) -> Trajectory:
 def sway_board(
     T_world_board: Array, anchor_ns: int, hand: HandMotion, rng: np.random.Generator
 ) -> Trajectory:
-    """Let a hand move the board about and through T_world_board (4, 4), where it is at anchor_ns exactly."""
+    """Let a hand move the board about and through T_world_board (4, 4), its exact pose at anchor_ns."""
     speed_mps = rng.uniform(*hand.speed_mps)
     frequency_hz, amplitude, phase_rad = _draw_sways(T_world_board, speed_mps, hand, rng)
     anchor = np.array([anchor_ns], dtype=np.int64)

@@ -19,7 +19,7 @@ class Material:
     Attributes:
         colour: linear (blue, green, red) albedo, 0..1.
         reflectivity: at the LiDAR's 905 nm, 0..1; 0 gives no return (glass).
-        pattern: what is printed on it.
+        pattern: texture on the surface.
         emission: linear radiance of its own, in units of the albedo.
     """
 

@@ -153,10 +153,10 @@ def _bag_files(folder: Path) -> list[Path]:
 
 @contextmanager
 def _plain(file: Path) -> Iterator[Path]:
-    """Give a file as rosbags knows it: decompressed, its suffix in lower case.
+    """Yield a copy of a file that rosbags can open: decompressed, with its suffix in lower case.
 
     Raises:
-        ValueError: it is no bag of its kind.
+        ValueError: not a bag, or damaged.
     """
     kind = kind_of(file)
     with TemporaryDirectory() as folder:
@@ -183,7 +183,7 @@ def _plain(file: Path) -> Iterator[Path]:
 def _bound_rosbags() -> None:
     """Let rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
 
-    Its tables of decompressors are replaced: they unpack whatever a chunk holds, before its size is checked.
+    The tables of decompressors are replaced, as theirs unpack a chunk before its size is checked.
     """
     lz4 = import_module("lz4.frame")
     from rosbags.rosbag1 import reader as ros1

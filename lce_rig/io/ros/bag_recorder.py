@@ -127,7 +127,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
     program was killed or the disk is full, lacks its index: `rosbag reindex` or `mcap recover` restores it.
 
     Attributes:
-        path: a ROS 1 bag where it ends in .bag, else the folder of a ROS 2 bag (mcap).
+        path: a ROS 1 bag if it ends in .bag, else the folder of a ROS 2 bag (mcap).
     """
 
     def __init__(self, path: Path, rig: Rig) -> None:
@@ -245,7 +245,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
 
 
 def _not_writable(path: Path, error: BaseException) -> SourceError:
-    """Say that a recording cannot be written, and that what was written before is not lost."""
+    """Return the error for a failed write; its hint explains how to restore the data written so far."""
     return SourceError(
         f"{path} cannot be written: {getattr(error, 'strerror', '') or str(error) or type(error).__name__}",
         "Make room or record elsewhere; `rosbag reindex` or `mcap recover` restores what was recorded.",

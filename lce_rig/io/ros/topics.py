@@ -77,10 +77,10 @@ def choose_topics(
     Args:
         path: the bag, for messages.
         topics: (message type, number of messages) by topic.
-        notes: receives what was chosen.
+        notes: receives the choices, in words.
 
     Returns:
-        Sensor by topic; at least one camera channel and one LiDAR, one of the two in a part of a recording.
+        Sensor by topic: at least one camera channel and one LiDAR, or either one in a part of a recording.
 
     Raises:
         SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
@@ -179,12 +179,12 @@ class SensorTopic:
         kind: "scans", "frames" or "events".
         n_messages: how many there are.
         rate_hz: from the receipt of the first to the bag's end; None for a single one.
-        frame: of the first message's header, "" without.
-        size_px: (width, height) of images and event arrays; None where they do not say.
-        n_rings: number of rings of a scan; None where points have none.
-        intrinsics: of its images, by its camera_info topic; None where there is no usable one.
-        note: the reason for which that is unusable, or what was done to fit it to the images.
-        cloud: the first point cloud of a topic of scans; None where it has packets.
+        frame: frame_id of the first message's header, or "".
+        size_px: (width, height) of images and event arrays; None if not stated.
+        n_rings: number of rings of a scan; None for points without a ring.
+        intrinsics: of its images, from its camera_info topic; None if missing or unusable.
+        note: the reason why the intrinsics are unusable, or the changes made to fit them to the images.
+        cloud: the first point cloud of a topic of scans; None for packets.
     """
 
     topic: str
@@ -216,7 +216,7 @@ def _namespace(topic: str) -> str:
 def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic]:
     """List the topics of a bag with images, events and point clouds, in the order of their names.
 
-    Depth images and images that are another topic's compressed ones are left out, and packets where there are
+    Depth images and compressed copies of another image topic are skipped; so are packets if the bag has
     point clouds.
 
     Args:
@@ -328,7 +328,7 @@ def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
 
 
 def _stem(info: str) -> str:
-    """Return what stands before camera_info in the last part of a topic, as "left_"."""
+    """Return the part before camera_info in the last part of a topic, such as "left_"."""
     return info.rpartition("/")[2].partition("camera_info")[0]
 
 

@@ -44,7 +44,7 @@ def draw_debug(
     mismatch: Refusal | None = None,
     events: Events | None = None,
 ) -> Picture:
-    """Draw the camera's image beside three views of the scan, with cause and action where one is refused.
+    """Draw the camera's image beside three views of the scan, with cause and action for a refused one.
 
     Args:
         image: None if it could not be read.
@@ -222,7 +222,7 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
 
 
 def _write(pane: Any, sensor: str, refusal: Refusal | None) -> None:
-    """State that a sensor found the board, or why not and what to do."""
+    """Write that a sensor found the board, or the refusal's cause and action."""
     state, colour = ("board found", _FOUND) if refusal is None else ("refused", _REFUSED)
     top: dict[str, Any] = {
         "xy": (0.02, 1),

@@ -36,7 +36,7 @@ _MAX_LOG = 50
 
 
 def to_json(state: LiveState, *, has_picture: bool) -> str:
-    """Write a state, without its image, for the page; what is not known is null.
+    """Write a state, without its image, as JSON for the page; unknown values are null.
 
     Args:
         state: the state.
@@ -58,7 +58,7 @@ def to_json(state: LiveState, *, has_picture: bool) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Turn records into what JSON knows."""
+    """Convert records and tuples to JSON types; numbers that are not finite become None."""
     if isinstance(value, Coverage):
         value = asdict(value)
     elif isinstance(value, (StreamState, Cue)):
@@ -71,7 +71,7 @@ def _plain(value: Any) -> Any:
 
 
 def beat(age_s: float | None) -> str:
-    """Write that nothing is new, and for how long; None where nothing has come yet."""
+    """Write the message for a page without news: the age of the last state, or None before the first."""
     return json.dumps({"beat": True, "age_s": None if age_s is None else round(age_s, 1)})
 
 
@@ -125,11 +125,11 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
     return [point if is_point else None for point, is_point in zip(rounded, is_seen, strict=True)]
 
 
-# A person who taps faster than the collection listens wants one thing.
+# Maximum requests in the queue: a person who taps faster wants one thing.
 _MOST_ASKED = 8
 # Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
 _LOOK_S = 0.03
-#: Between two updates.
+#: Time between two updates, s.
 PERIOD_S = 0.1
 #: Without news the page gets a message this often, and so knows that it is still connected.
 BEAT_S = 1.0
@@ -167,7 +167,7 @@ class Feed:
         self._asked.append(asked)
 
     def asked(self) -> TakeBack | None:
-        """Take the oldest request; None where nothing is asked for."""
+        """Remove and return the oldest request; None if the queue is empty."""
         return self._asked.popleft() if self._asked else None
 
     def newest(self) -> tuple[int, LiveState] | None:
@@ -231,7 +231,7 @@ class Viewer:
             if newest is None or newest[0] <= self._delivered:
                 break
             await asyncio.sleep(_GOODBYE_S / 10)
-        # Closing waits until the page has taken what was sent, and a stuck one never does.
+        # Closing waits until the page has read all messages; a stuck page never does.
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), _GOODBYE_S)
 
@@ -255,7 +255,7 @@ class Viewer:
             match said:
                 case {"visible": bool(is_looked_at)}:
                     if is_looked_at and not self._is_looked_at:
-                        # What was sent meanwhile had no image.
+                        # The states sent meanwhile had no image.
                         self._pixels, self._state = None, 0
                     self._is_looked_at = is_looked_at
                     return True
@@ -300,7 +300,7 @@ class Pages:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         tokens = (request.query.get("token", ""), request.cookies.get(self._cookie(request), ""))
-        # In constant time, so that a wrong token does not tell how much of it is right.
+        # In constant time, so that the response time does not reveal the correct part of a wrong token.
         if not any(
             hmac.compare_digest(text.encode(errors="replace"), self._token.encode()) for text in tokens
         ):

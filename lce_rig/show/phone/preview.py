@@ -90,11 +90,11 @@ def _network_addresses() -> list[str]:
 # 72 bits: beyond guessing, and can still be typed into a phone.
 _TOKEN_BYTES = 9
 _STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
-# For the rest of a request that was answered before its end.
+# Time to read the rest of a request that was answered before its end, s.
 _LINGERING_S = 1.0
 # asyncio sets up a connection in the three turns of its loop after it has accepted it.
 _TURNS_TO_SET_UP = 4
-# What strangers send wrongly must not reach the terminal that shows the collection.
+# Malformed requests from strangers must not be logged on the terminal that shows the collection.
 _SILENT = logging.Logger("preview", logging.CRITICAL + 1)
 
 
@@ -144,7 +144,7 @@ class Preview:
         self._feed.publish(state)
 
     def asked(self) -> TakeBack | None:
-        """Take the oldest request of a page; None where nothing is asked for."""
+        """Remove and return the oldest request of a page; None if the queue is empty."""
         return self._feed.asked()
 
     @property

@@ -33,9 +33,9 @@ from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.tables import result_tables, rig_table, scene_words
 
 _LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
-# The statement names the expected error at this distance.
+# Distance at which the report states the expected error, m.
 _USUAL_M = 10.0
-# Captures with more than this many times the median residual are marked. A page holds so many pictures.
+# Ratio to the median residual from which captures are marked; maximum number of images on a page.
 _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 
@@ -180,7 +180,7 @@ def _statement(c: Calibration) -> str:
 
 
 def _reasons(c: Calibration) -> list[tuple[str, str]]:
-    """List severity and text of the findings: causes, what follows from them, notes."""
+    """List severity and text of the findings: causes, consequences, notes."""
     rows = []
     for finding in c.findings:
         if finding.follows:
@@ -224,16 +224,16 @@ _EVENTS_NS = 20_000_000
 
 
 def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics) -> str:
-    """Draw a capture's image with the board's outline; raw events where it holds no image.
+    """Draw a capture's image with the board's outline; raw events if the capture has no image.
 
     Args:
         capture: with the data.
-        c: the result, whose channels are looked at in their order.
+        c: the result; its channels are tried in their order.
         board: of the outline.
         lens: of the camera.
 
     Returns:
-        A data URI; "" where the capture holds no picture, or a damaged one.
+        A data URI; "" if the capture has neither image nor events, or damaged ones.
     """
     observation = c.observations.get(capture.name)
     outline, stamp_ns = np.empty((0, 2)), None
