@@ -61,7 +61,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection | Image:
-    """Rebuild what `to_arrays` flattened.
+    """Rebuild the detection or image from the arrays of `to_arrays`.
 
     Raises:
         ValueError: the arrays are not a detection.

@@ -42,8 +42,8 @@ class Search(Generic[Boards]):
 
     Attributes:
         located: the board in an image, or the surfaces of its size in a scan, likeliest first, which can be
-            followed into the next one; or why there are none.
-        usable: what of them the profile's limits admit; else why they do not.
+            followed into the next one; or the refusal.
+        usable: those within the profile's limits, or the refusal.
     """
 
     located: Boards | Refusal

@@ -49,7 +49,7 @@ def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
         name: "radtan4" or "radtan5"; a fisheye stays a fisheye.
 
     Returns:
-        The fit, and its distance from the given ones over the image, px, rms and maximum; 0 if it is the same.
+        The fit, and its distance from the given ones over the image, px, rms and maximum; 0 if identical.
     """
     model = MODELS[name if given.model == "radtan" else "equidistant"]
     n = len(model.coefficients)

@@ -195,9 +195,9 @@ def fit_tree(
     """Change the joints of a robot's tree to the poses of calibrated sensors.
 
     Of the sensors that calibrations connect, the one nearest to the root stays. Each other sensor of the
-    robot keeps its parent, and only its joint's pose changes; a sensor that the robot lacks is added below the
-    sensor it was calibrated with. An optical frame of the robot stays unchanged below its body. The profile's
-    `mount` adds its sensor to a robot that lacks it.
+    robot keeps its parent, and only its joint's pose changes; a sensor that the robot lacks is added below
+    the sensor it was calibrated with. An optical frame of the robot stays unchanged below its body. The
+    profile's `mount` adds its sensor to a robot that lacks it.
 
     Args:
         robot: its own tree; None for one of the sensors alone, under the profile's `mount` if it has one.

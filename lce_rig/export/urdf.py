@@ -26,7 +26,7 @@ from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-# Rounding of the float64 that ROS writes is far below; a quaternion that differs more is no rotation.
+# Tolerance of a quaternion's norm, far above the rounding of ROS's float64; more is not a rotation.
 _UNIT_TOLERANCE = 1e-3
 _ORIGIN = re.compile(rb"""<origin\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")

@@ -336,7 +336,7 @@ class Place:
         """Copy a folder of this name there, of plain files, to a new one here.
 
         Returns:
-            Its entries that are not plain files, or too large; if there are any, nothing is copied.
+            The first of its entries that are not plain files, or too large; then nothing is copied.
 
         Raises:
             TargetError: it cannot be reached or read.

@@ -195,7 +195,7 @@ class Vlp16Stream:
 
         Returns:
             "late" for a packet to skip: it was sent before another that has arrived, or twice;
-            "after a step" if the sensor's clock was set, as on locking to a pulse, or its return mode changed.
+            "after a step" if the sensor's clock (as when it locks to a pulse) or its return mode was set.
         """
         last, self._last = self._last, packet
         if last is None:

@@ -85,7 +85,7 @@ class _ImageWindow(NamedTuple):
 def _look_through_centres(
     scene: Scene, backdrop: Backdrop, window: _ImageWindow, occluders: Raycaster | None
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Cast one ray per pixel: label (h, w) of its surface, -1 the backdrop; its colour and light (h, w, 3)."""
+    """Cast one ray per pixel: label (h, w) of its surface, -1 the backdrop; its colour, light (h, w, 3)."""
     shape = window.backdrop.shape
     rays = pixel_rays(window.corner_rays).reshape(-1, 3)
     hits = scene.cast_moving(backdrop.origin, rays)
@@ -109,7 +109,7 @@ def _look_through(
     pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
     rays: Array,
 ) -> Array:
-    """Average the light of n rays (M, n, 3) per pixel: (M, 3), with that on carrier and board from `lights`."""
+    """Average n rays (M, n, 3) per pixel: (M, 3), with the light on carrier and board from `lights`."""
     v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
     flat = rays.reshape(-1, 3)
     hits = scene.cast_moving(origin, flat)

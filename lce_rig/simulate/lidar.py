@@ -144,7 +144,7 @@ _AZIMUTH_STEP_RAD = np.radians(0.01)
 _INSTANT_NS, _FIRINGS_PER_INSTANT = 884_736, 256
 
 
-# Rotation rates, Hz, not multiples: a rosette's two prisms, for all its lines; the Mid-360's rotor and mirror.
+# Rotation rates, Hz, not multiples: a rosette's two prisms, for all its lines; a Mid-360's rotor and mirror.
 _PRISMS_HZ, _MID360_HZ = (1213.7, -771.3), (10.37, 2311.7)
 _LINES = 4  # of a Mid-360: beams side by side in elevation
 _LINE_RAD = np.radians(0.7)

@@ -275,7 +275,7 @@ def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOption
 def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
     """Find the mean firing time of a scan's board returns; half a scan after its timestamp without any.
 
-        Each return is compared with the board's pose at that return's own time.
+    Each return is compared with the board's pose at that return's own time.
     """
     first_ns = scan.stamp_ns or 0
     middle_ns = first_ns + round(0.5e9 / rig.lidars[scan.sensor].rate_hz)

@@ -73,10 +73,10 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
 
 
 def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
-    """Measure how long a LiDAR takes from its first to its last return from the board.
+    """Measure the time from a LiDAR's first to its last return from the board, s.
 
     Args:
-        lidar: the board in one scan; without firing times the azimuth it spans tells.
+        lidar: the board in one scan; without firing times, its span in azimuth is used.
         period_s: of one revolution.
     """
     if lidar.offset_ns is not None and len(lidar.offset_ns):
@@ -185,12 +185,12 @@ def explain_missing_board(
     limits: QualitySettings,
     frame_speed_mps: float = math.nan,
 ) -> Refusal:
-    """Return the fault of the events that prevents a detection; `seen` if there is none.
+    """Return the fault of the events that prevents a detection, or else `seen`.
 
     Args:
         events: about the image.
         stamp_ns: of the image.
-        seen: why there is no image, or no board in it.
+        seen: the refusal, because the image is missing or has no board in it.
         limits: `quality` of the rig profile.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
     """

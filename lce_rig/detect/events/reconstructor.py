@@ -121,7 +121,7 @@ class IntensityScale:
 
 
 def _bounds(picture: FloatArray) -> NDArray[np.float64]:
-    # Every fourth pixel in each direction tells the percentiles well enough.
+    # Every fourth pixel in each direction is enough for the percentiles.
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
 
 
@@ -149,8 +149,8 @@ class Reconstructor:
     """Runs over one event stream, with a recurrent state for the whole stream.
 
     Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
-    asked for change what the network has seen: an image at a timestamp is a side step from the running state
-    with the events up to the timestamp.
+    asked for change the network's state: an image at a timestamp is a side step from the running state with
+    the events up to the timestamp.
 
     Args:
         channel: the channel of the images.
@@ -283,7 +283,7 @@ class Reconstructor:
             self._commit(end_ns)
 
     def _commit(self, end_ns: int) -> FloatArray:
-        """Close the current window and step; what is left of its events begins the next."""
+        """Close the current window and step; its remaining events begin the next one."""
         assert self._current is not None
         window = self._current
         events = window.events.between(window.start_ns, end_ns)

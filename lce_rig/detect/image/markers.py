@@ -31,26 +31,26 @@ Places = dict[int, Array]
 """Corners (4, 2) px of markers by their ids."""
 # Images narrower than this are searched at twice their size first.
 _WIDE_PX = 700
-# Two markers show that they are the board's.
+# Minimum number of markers that identify the board.
 _MIN_MARKERS = 2
-# Markers and corners lie so near to where a pose has them, of a marker's side, or they are others.
+# Maximum distance of a marker's corners from the pose's prediction, in sides of a marker.
 _MAX_AWAY = 0.25
-# Of the markers that belong to a board, so many fit one pose if the profile has their layout.
+# Minimum share of the board's markers that fit one pose, if their layout is the profile's.
 _MIN_FITTING = 0.6
-# Of all markers, so many must be foreign to be those of the board in the image, or of a second one.
+# Minimum share of foreign markers for a refusal: another board is in the image, or a second one.
 _MIN_FOREIGN = 0.15
-# A corner's contrast is that of others at least, and its grey values differ from the model's so much at most.
+# Limits of a corner, relative to the others: minimum contrast, maximum misfit of the grey values.
 _MIN_CONTRAST, _MAX_MISFIT = 0.5, 2.0
-# It lies from where the board's pose has it no farther than others, in units of their median.
+# Maximum distance of a corner from the pose's prediction, in units of the median.
 _MAX_OFF = 7.0
-# A board that is followed is searched for again when more corners than this share of its own come into view.
+# Maximum ratio of new corners to followed ones; beyond, the board is searched for again.
 _MOST_NEW = 0.25
-# Edges are measured up to this share of the way to the next thing that is printed.
+# Measured length of edges, as a share of the way to the next printed element.
 _FREE = 0.8
-# Black is darker than its surroundings by so many grey values; by so many deviations of an AprilGrid's noise.
+# Threshold of black below its surroundings, grey values: least, most; in sigmas of an AprilGrid's noise.
 _DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
-# Gaps between tags may differ from the profile's by so much of a tag's side: more moves poses by centimetres.
-# What differs by fewer deviations of the measurement is not known to differ.
+# Limits of the gaps' difference from the profile's: in sides of a tag (more moves poses by centimetres), and
+# in standard deviations of the measurement (fewer are not significant).
 _MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
 _GAP_SHARES = (0.05, 1.2)
 
@@ -63,11 +63,11 @@ def find_marked_grid(
     Args:
         grey: (H, W).
         board: one that has markers.
-        intrinsics: of the camera; rough ones will do.
+        intrinsics: of the camera; rough ones are sufficient.
         is_thorough: whether to search at further scales, and for markers of other dictionaries.
 
     Returns:
-        Crossings with hidden corners at NaN; None if there are no markers; or why they are not the board's.
+        Crossings with hidden corners at NaN; None without markers; a refusal if they are not the board's.
     """
     places = _search(grey, board, is_thorough=is_thorough)
     wanted = range(board.first_id, board.first_id + len(markers_of(board).ids))
@@ -197,11 +197,11 @@ def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array 
     """Fit one pose to markers.
 
     OpenCV's releases differ by half a turn in the first corner of AprilTags, and by the squares with markers
-    of a ChArUco board with an even number of rows: the reading that more markers agree with is taken.
+    of a ChArUco board with an even number of rows: the reading that fits more markers is used.
 
     Returns:
-        The pose (4, 4); the number of markers that lie where it has them; and whether the board is a ChArUco
-        board of OpenCV's before 4.6, whose colours are exchanged.
+        The pose (4, 4); the number of markers that fit it; and whether the board is a ChArUco board of
+        OpenCV's before 4.6, whose colours are exchanged.
     """
     ids = sorted(places)
     pixels = np.array([places[number] for number in ids])
@@ -308,7 +308,7 @@ def _measure(
             away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
             is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
             is_trusted, T_cam_board = is_seen, solved.T_cam_board
-        # Patches in the middles of which their corners lie are free of what is printed about them.
+        # Patches centred on their corners are free of neighbouring print.
         grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
     crossings.grid_px[~is_seen] = np.nan
     crossings.is_fitted[...] = is_seen

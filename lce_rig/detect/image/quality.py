@@ -57,7 +57,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
 
 
 def _shortest_side_px(grid_px: Array) -> float:
-    """Measure the shortest side of a square; where no two neighbours are visible, by other corners."""
+    """Measure the shortest side of a square, px; without visible neighbours, from other corners."""
     sides = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
     if np.isfinite(lengths).any():
@@ -99,7 +99,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
 
 
 def is_whole(grey: NDArray[np.uint8], grid_px: Array) -> bool:
-    """Tell whether a grid of corners is a whole pattern, and so its number of corners that of a board."""
+    """Check that a grid of corners is a whole pattern, and so its number of corners that of a board."""
     outer_contrast, goes_on = extent(grey, grid_px)
     return outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on
 
@@ -113,7 +113,7 @@ def _widened(grid_px: Array) -> Array:
 
 
 def _alternation(values: Array, signs: Array) -> float:
-    """Measure by how much the values of positive sign exceed the others."""
+    """Compute the mean excess of the values of positive sign over the others."""
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 

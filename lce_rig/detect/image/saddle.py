@@ -29,9 +29,9 @@ class Crossings:
     """The crossings fitted to a grid of corners.
 
     Attributes:
-        grid_px: (rows, cols, 2) corners; where a fit failed, as they were given.
+        grid_px: (rows, cols, 2) corners; the given ones if a fit failed.
         is_fitted: (rows, cols) whether the fit succeeded.
-        contrast: (rows, cols) white minus black, grey values; the sign tells the colour of the quadrants.
+        contrast: (rows, cols) white minus black, grey values; its sign is that of the quadrants' colours.
         edge_sigma_px: (rows, cols, 2) blur across the edges that run down the columns and along the rows.
         misfit: (rows, cols) rms of the grey values about the model.
     """
@@ -44,12 +44,12 @@ class Crossings:
 
 
 class Patches(NamedTuple):
-    """The surroundings of corners that are no squares of a checkerboard.
+    """The surroundings of corners that do not lie between squares of a checkerboard.
 
     Attributes:
         e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
         e2_px: (rows, cols, 2) one unit down on the board.
-        clear: distance from an edge, in units, beyond which something else is printed.
+        clear: distance from an edge, in units, up to which the surroundings are free of other print.
     """
 
     e1_px: Array
@@ -94,12 +94,12 @@ def _fit_patches(
     patches: Patches | None,
     n_steps: int = _STEPS,
 ) -> tuple[Crossings, Array]:
-    """Fit patches of at most so many samples a side; the parameters (K, 8) serve finer patches as start."""
+    """Fit patches of at most most_samples per side; parameters (K, 8) serve finer patches as a start."""
     if patches is None:
         patches = Patches(np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0), REACH)
     e1, e2, clear = patches
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
-    # Width of a square across its edges: what one unit of a and of b is in px.
+    # Width of a square across its edges: length of one unit of a and of b, px.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
     n = int(np.clip(2 * round(REACH * longest_px) + 1, 7, most_samples))

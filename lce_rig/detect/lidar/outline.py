@@ -43,7 +43,7 @@ class Rays:
     """Rays that pierce a plate's plane, M of them.
 
     Attributes:
-        uv: (M, 2) where they do, m.
+        uv: (M, 2) points of intersection with the plane, m.
         is_on: (M,) whether they return from the plane; else they passed beside the plate.
     """
 
@@ -60,7 +60,7 @@ class Outline(NamedTuple):
 
     Attributes:
         placement: with the nominal size; `error_m` is the mean of -ln P over the rays near the border.
-        growth_m: (2,) by how much half its width and half its height exceed the nominal ones.
+        growth_m: (2,) excess of half its width and half its height over the nominal ones.
         cov: (5, 5) of u, v, angle and growth.
     """
 
@@ -148,7 +148,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
 
 
 def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
-    """Find the middle (2,) of what is wider than half the plate's short side, m: a stand is narrower.
+    """Find the middle (2,) of the parts wider than half the plate's short side, m: a stand is narrower.
 
     The middle of a patch lies towards the stand that its plate merges with.
     """
@@ -235,7 +235,7 @@ class Strips(NamedTuple):
     Attributes:
         uv: (K, 2) their middles where the plate's returns end, m.
         outwards: (K, 2) unit normals.
-        off_m: (K,) by how much farther out they lie than the fitted outline.
+        off_m: (K,) distance outwards from the fitted outline.
         sigma_m: (K,) standard deviations.
         side: (K,) of `measure_smears`.
     """
@@ -272,7 +272,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
-            # Where no ray comes near the border, it may lie anywhere between the rays on its two sides.
+            # Without a ray near the border, it may lie anywhere between the rays on its two sides.
             p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr((_OFFSETS_M[:, None] - s) / blur)
             log_p = np.log(np.where(is_on, p, 1 - p))
             total = np.stack([np.bincount(strip, row, n_strips) for row in log_p])

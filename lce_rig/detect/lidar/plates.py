@@ -11,7 +11,7 @@ from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Indices, OrderedSca
 from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 
 MAX_PAIRS = 400
-CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one cell count as alike
+CELL = 0.5  # of the board's diagonal: with too many pairs, those of one cell count as alike
 N_ROUNDS = 2
 BLOCK = 32  # of centres, whose distances fit the cache
 MAX_PLATES = 10
@@ -272,8 +272,8 @@ def screen_plates(
         ends: (K, M, 2) as of `propose_plates`.
         board: gives the rectangle.
         limit_m: largest error of an outline.
-        on_stand: whether to leave out chords shorter than half the board's short side: what the plate stands
-            on, flush with it, is narrower than the plate and ends elsewhere.
+        on_stand: whether to leave out chords shorter than half the board's short side: a stand flush with the
+            plate is narrower than the plate, and its chords end elsewhere.
     """
     if len(plates.centre) == 0:
         return []

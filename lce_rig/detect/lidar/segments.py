@@ -179,7 +179,7 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
 def cut_segments(scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf) -> Segments:
     """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
 
-    A run whose returns leave its chord is cut where they leave it most, as a polyline is simplified.
+    A run with returns off its chord is cut at the farthest one, as a polyline is simplified.
 
     Args:
         scan: all returns.

@@ -13,8 +13,8 @@ N_ANGLES = 12
 CAP_M = 0.10
 MAX_SAMPLES = 64
 MIN_ON_RING = 3  # returns that make a chord
-DARK_DEPTH_M = 0.10  # a dark square that a beam grazes is measured as lying so far behind the plane at most
-# What a beam says about the outline: it ends a chord, or should lie inside or outside.
+DARK_DEPTH_M = 0.10  # maximum depth behind the plane measured for a dark square that a beam grazes
+# Role of a beam for the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)
 
 
@@ -220,7 +220,7 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
 
 
 def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Array, Indices]:
-    """Collect what beams say about the outline: points (M, 2) of the view and their kind (M,)."""
+    """Collect the beams that locate the outline: points (M, 2) of the view and their kind (M,)."""
     first, last = find_chords(scan, view, placement)
     ends = view.uv[np.concatenate([first, last])]
     bound = np.zeros(len(view.uv) + 1, dtype=np.int8)
@@ -228,11 +228,11 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
     bound[last + 1] -= 1
     is_inside = view.is_on & (np.cumsum(bound[:-1]) > 0)
     inside, outside = view.uv[is_inside], view.uv[view.is_behind]
-    # Beams far from any border say the same as their neighbours: a sample is enough.
+    # Beams far from any border repeat their neighbours, so a sample is enough.
     inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
     outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
-    # The border lies farther out than an end beyond which a dark square may lie, or that something hides.
+    # The border lies farther out than an end that is hidden, or beyond which a dark square may lie.
     if view.dark_m:
         kind[: len(ends)][_is_before_dark(scan, view, first, last)] = INSIDE
     if view.may_be_hidden:
@@ -241,9 +241,9 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
 
 
 def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> NDArray[np.bool_]:
-    """Tell between which neighbours of the beams on the plane (K,) a dark square may lie (K - 1,).
+    """Find the pairs of neighbouring beams on the plane (K,) with a possible dark square between (K - 1,).
 
-    The way between them is short and inside the outline, and no beam between them returns from elsewhere.
+    The two are close together and inside the outline, and no beam between them returns from elsewhere.
     """
     is_inside = placement.distance_m(view.uv[on]) < 0
     is_short = np.linalg.norm(np.diff(view.uv[on], axis=0), axis=1) <= view.dark_m
@@ -253,14 +253,14 @@ def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> 
 
 
 def _is_before_dark(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Tell beyond which ends (2 C,) of chords the ring goes on, but not with a beam that passes by."""
+    """Find ends (2 C,) of chords beyond which the ring goes on, but not with a beam that passes by."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     passes = view.is_behind[beyond] & is_next
     return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
 
 
 def _is_before_cover(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Tell beyond which ends (2 C,) of chords the next beam returns from before the plane."""
+    """Find ends (2 C,) of chords beyond which the next beam returns from before the plane."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     is_same = scan.ring[view.member[beyond]] == scan.ring[view.member[end]]
     return np.asarray(is_same & is_next & (view.height_m[beyond] > view.tolerance_m))

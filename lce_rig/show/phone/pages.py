@@ -125,7 +125,7 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
     return [point if is_point else None for point, is_point in zip(rounded, is_seen, strict=True)]
 
 
-# Maximum requests in the queue: a person who taps faster wants one thing.
+# Maximum requests in the queue: repeated quick taps mean one request.
 _MOST_ASKED = 8
 # Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
 _LOOK_S = 0.03
