@@ -90,12 +90,12 @@ class ExportJob:
         return both if len(self.rig.lidars) > 1 else calibration.camera
 
     def image_topic(self, calibration: Calibration) -> str:
-        """Name the topic of a calibration's images."""
+        """Return the topic of a calibration's images."""
         camera = self.rig.cameras[calibration.camera]
         return camera.channels[calibration.channels[0]].topic or f"/{calibration.camera}"
 
     def points_topic(self, calibration: Calibration) -> str:
-        """Name the topic of a calibration's point clouds."""
+        """Return the topic of a calibration's point clouds."""
         return self.rig.lidars[calibration.lidar].topic or f"/{calibration.lidar}/points"
 
     def head(self, content: str, *calibrations: Calibration, of_one_camera: bool = False) -> list[str]:

@@ -65,7 +65,7 @@ def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
 
 
 def lens_for(job: ExportJob, format_name: str, camera: str, model: str) -> tuple[Intrinsics, list[str]]:
-    """Give a camera's model with the coefficients of a format; file and finding say if it is a fit.
+    """Return a camera's model with the coefficients of a format; file and finding note a fit.
 
     Args:
         job: which gets the finding.

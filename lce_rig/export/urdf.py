@@ -86,7 +86,7 @@ def read_robot(path: Path) -> RobotTree:
 def read_robot_bag(path: Path) -> RobotTree:
     """Read the transforms on /tf_static of a ROS 1 bag, a ROS 2 bag or an mcap file.
 
-    Of several transforms to one frame the last counts, as in tf.
+    The last of several transforms to one frame counts, as in tf.
 
     Raises:
         SourceError: the bag cannot be read, is damaged, or has no static transforms.

@@ -76,7 +76,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """List the sessions and recordings below a folder.
 
     A manifest, `fleet.yaml` in the folder unless another is given, names them by patterns.
-    Without one, every session is taken.
+    Without one, every session is used.
 
     Args:
         root: folder of the sessions and recordings.
@@ -145,7 +145,7 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
 
 
 def folder_name(text: str) -> str:
-    """Make a name of a folder from any text; different texts give different names."""
+    """Build a folder's name from any text; different texts give different names."""
     name = _SAFE.sub("_", text).strip(".")[:80]
     if name == text:
         return name

@@ -83,7 +83,7 @@ _COMPRESSION = "lz4"
 
 
 def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mapping[str, str]) -> list[Row]:
-    """Put the columns `PAIR` of each result into its row; figures that are not finite are null.
+    """Add the columns `PAIR` of each result to its row; figures that are not finite are null.
 
     Args:
         rows: of one session, as in `ROWS`: one with status "ok" for all results, and one for each camera and
@@ -126,7 +126,7 @@ def _flat(column: Any) -> Array:
 
 
 def as_table(rows: Iterable[Row]) -> Any:
-    """Put rows into a `pyarrow.Table` of `SCHEMA`; other names are ignored."""
+    """Build a `pyarrow.Table` of `SCHEMA` from rows; other names are ignored."""
     return pa.Table.from_pylist(list(rows), schema=SCHEMA)
 
 
@@ -361,7 +361,7 @@ class Registry:
             unknown = as_table(row for rows in read for row in rows)
         table = pa.concat_tables([old, new, unknown])
         table = table.filter(pc.is_in(table["folder"], value_set=pa.array(folders, pa.string())))
-        # Of the results of one source, the last stays.
+        # Only the last result of each source stays.
         finished = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
         finished = finished.aggregate([("finished", "max")])
         order = [("source", "ascending"), ("finished_max", "ascending"), ("folder", "ascending")]

@@ -217,7 +217,7 @@ def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
 
 
 def user_name() -> str:
-    """Name the user and this computer; "" if the system has no name for them."""
+    """Return user@computer; "" if the system has no name for them."""
     with suppress(OSError, KeyError):
         return f"{getpass.getuser()}@{socket.gethostname()}"
     return ""

@@ -171,7 +171,7 @@ class FleetReport:
 
     @classmethod
     def of(cls, registry: Registry) -> "FleetReport":
-        """Make the report of a registry.
+        """Build the report of a registry.
 
         Raises:
             SessionError: the registry has no table, or it cannot be read.

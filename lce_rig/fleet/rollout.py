@@ -1,4 +1,4 @@
-"""Put the newest results of many robots onto them, one after the other, until the first failure.
+"""Deploy the newest results of many robots to them, one after the other, until the first failure.
 
 Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.

@@ -141,7 +141,7 @@ def run_fleet(
 
 
 def _rows_of(future: Any, job: Job, settings: Settings) -> list[Row]:
-    """Take a task's rows; of one that no worker survived, write the cause."""
+    """Return a task's rows; of one that no worker survived, a row with the cause."""
     try:
         rows: list[Row] = future.result()
         return rows

@@ -68,7 +68,7 @@ class Storage:
 
     @contextmanager
     def reached(self) -> Iterator[tuple[Any, str]]:
-        """Give the file system that fsspec has for the place, and the path there; see the class."""
+        """Return fsspec's file system for the place, and the path there; see the class."""
         try:
             yield url_to_fs(self.url)
         except (LceRigError, *_ABSENT):

@@ -82,7 +82,7 @@ class TargetSettings(Settings):
         return self
 
     def for_robot(self, robot: str) -> "TargetSettings":
-        """Put a robot's name in place of {robot}; results of other robots are refused there.
+        """Return the settings with a robot's name for {robot}; results of other robots are refused there.
 
         Raises:
             ValueError: no robot can have this name.

@@ -122,7 +122,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
             kind = next(kind for each, kind in findings.OF_ERRORS.items() if isinstance(error, each))
             cause = error.finding if isinstance(error, NotEnoughDataError) else None
             failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
-            # Name files by where the session lies.
+            # Files are named by the session's place.
             failed["detail"] = failed["detail"].replace(str(scratch / "session"), job.source)
             return publish(registry, [failed], start_s)
 

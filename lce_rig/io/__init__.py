@@ -20,7 +20,7 @@ RECORDINGS = {
     **dict.fromkeys(sorted(_PACKETS), "lce_rig.io.velodyne_scans:PcapRecording"),
     **dict.fromkeys(sorted(_EVENTS), "lce_rig.io.events:EventCameraFile"),
 }
-"""Reader by suffix, or "folder"; imported when wanted."""
+"""Reader by suffix, or "folder"; imported on first use."""
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
 _CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
@@ -45,7 +45,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
 
 
 def recognise(path: Path) -> str:
-    """Name the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
+    """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
 
     Raises:
         SourceError: nothing is there, or no recording.
@@ -114,7 +114,7 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
         if not kinds[_PACKETS] or _holds_clouds(path):
             return [(path, options)]  # A folder of images and point clouds; other files in it are ignored.
         folders, images = [], [path]
-    # A bag in several pieces lies in one folder, and is read as one.
+    # A bag in several pieces is in one folder, and is read as one.
     bags = ([path] if kinds[_BAGS] else []) + folders
     is_one_of_many = len(bags) + len(images) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
     options = replace(options, is_part=options.is_part or is_one_of_many)

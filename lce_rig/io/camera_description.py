@@ -27,7 +27,7 @@ FORMS = (
     "camera_info of ROS (YAML, ost.txt, or of ros2 topic echo), Kalibr's camchain, OpenCV's FileStorage "
     "(YAML or XML) with camera_matrix, dist_coeffs, image_width and image_height, or FAST-LIVO2's camera"
 )
-# Descriptions are pages; a recording given by mistake is not parsed.
+# Maximum size: descriptions are a few pages, and a recording given by mistake is not parsed.
 _MAX_BYTES = 1 << 20
 _MAX_DEPTH = 6
 # Ends of keys of a second camera in one file, as OpenCV's stereo samples write them.
@@ -182,7 +182,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def describe_message(info: Any) -> CameraDescription:
-    """Take the fields of a sensor_msgs/CameraInfo of ROS 1 or ROS 2.
+    """Read the fields of a sensor_msgs/CameraInfo of ROS 1 or ROS 2.
 
     Raises:
         ValueError: a field is not as it has to be.

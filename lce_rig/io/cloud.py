@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.ring_apex import MAX_APEX_M, find_apex
 from lce_rig.rig import LidarSettings
 
-# Of rings that are inferred: bin of elevation, most of them, and how far a laser lies above the origin.
+# Inferred rings: bin of elevation, maximum number, maximum height of a laser above the origin.
 BIN_RAD = np.radians(0.02)
 MAX_RINGS = 256
 MAX_OFFSET_M = 0.015
@@ -187,7 +187,7 @@ def to_scan(
     is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
     if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
-    # Returns of the LiDAR's housing and mount, which lie on no ring and are not used.
+    # Returns of the LiDAR's housing and mount are on no ring and are not used.
     is_far = is_kept & (np.hypot(flat_m, z) >= settings.min_range_m)
     if not is_far.any():
         raise SourceError(
@@ -358,10 +358,10 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
     ticks = values.astype(np.float64)
-    # Beyond a century of nanoseconds it is not a time in any unit.
+    # More than a century in nanoseconds is not a time in any unit.
     if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None
-    # A float32 of Unix time moves in steps of two minutes.
+    # The resolution of a float32 of Unix time is two minutes.
     step = float(np.spacing(np.abs(values).max()))
     return ticks if np.ptp(ticks) > 1000 * step else None
 
@@ -372,7 +372,7 @@ def _unit(ticks: NDArray[Any]) -> str | None:
     for unit, scale in NS_PER_UNIT.items():
         if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:
             return unit
-    # A sector of a scan may be shorter than any scan: then it is the usual unit of the type.
+    # A sector of a scan may be shorter than any scan; it has the usual unit of its type.
     usual = _usual_unit(ticks)
     return usual if span * NS_PER_UNIT[usual] * 1e-9 < SWEEP_S[0] else None
 

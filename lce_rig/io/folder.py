@@ -39,7 +39,7 @@ Pairs: TypeAlias = list[tuple[int, int]]
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Give a sort key that puts "scan2" before "scan10"."""
+    """Return a sort key that puts "scan2" before "scan10"."""
     return [
         (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
     ]
@@ -85,7 +85,7 @@ def pair_names(
         SourceError: no name matches.
     """
     n, image_ns, cloud_ns = len(images), parse_times(images), parse_times(clouds)
-    # An image of the same name in another format makes a pair of its own.
+    # An image of the same name in another format makes a separate pair.
     place = {name: j for j, name in reversed(list(enumerate(clouds)))}
     by_name = [(i, place[name]) for i, name in enumerate(images) if name in place]
     candidates: list[tuple[Pairs, str]] = [(by_name, "paired by equal file names")]
@@ -417,7 +417,7 @@ class FolderRecording:
             )
         else:
             clouds, *others = images
-        # The second image of one camera that goes with a point cloud makes a pair of its own.
+        # The second image of one camera that goes with a point cloud makes a separate pair.
         together: dict[tuple[int, int], list[FileOnDisk]] = {}
         lone: list[str] = []
         for of_sensor, pairs in zip(others, self._pair(others, clouds), strict=True):

@@ -83,7 +83,7 @@ class PcapFile:
         with BoundedPath(self.path).open("rb") as file:
             try:
                 for stamp_s, raw in dpkt.pcap.UniversalReader(file):
-                    # dpkt gives stamps of ns as exact decimals and others as floats, which hold a us.
+                    # dpkt returns timestamps of ns as exact decimals, others as floats with 1 us resolution.
                     is_exact = isinstance(stamp_s, Decimal)
                     host_ns = int(stamp_s * _NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
                     datagram = self._read(raw, host_ns)

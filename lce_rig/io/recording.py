@@ -103,7 +103,7 @@ def fingerprint(files: Iterable[Path]) -> str:
 def choose_camera(
     rig: Rig, options: SourceOptions, notes: list[str], camera: str | None = None
 ) -> tuple[str, str]:
-    """Name the (camera, channel) that a folder's images belong to: as asked, else the rig's only camera.
+    """Choose the (camera, channel) of a folder's images: as asked, else the rig's only camera.
 
     Args:
         rig: the profile.
@@ -135,7 +135,7 @@ def choose_camera(
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
-    """Name the LiDAR that a folder's point clouds belong to: as asked, else the rig's first.
+    """Choose the LiDAR of a folder's point clouds: as asked, else the rig's first.
 
     Raises:
         SourceError: the rig has no such LiDAR.
@@ -151,7 +151,7 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
 
 
 def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
-    """Name the (camera, channel) that a file of events belongs to: as asked, else the first with events.
+    """Choose the (camera, channel) of a file of events: as asked, else the first with events.
 
     Raises:
         SourceError: the rig has no camera with a channel of kind events, or not the one asked for.
@@ -325,7 +325,7 @@ def _belongs(recording: Recording, group: Sequence[Recording], later: Sequence[R
 
 
 def require_sensors(recording: ContinuousRecording, rig: Rig) -> None:
-    """Make sure that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
+    """Check that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
 
     Raises:
         SourceError: it does not; the hint names the recording to add.

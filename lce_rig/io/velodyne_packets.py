@@ -175,7 +175,7 @@ def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
 
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
-# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
+# Position packets arrive 50 to 150 times per second and repeat a sentence until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
 # The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
@@ -206,7 +206,7 @@ class VelodyneClock:
         self._delays_ns.clear()
 
     def see_data(self, packet: DataPacket, elapsed_ns: int) -> None:
-        """Take note of an arrival.
+        """Record an arrival.
 
         Args:
             packet: in its place.

@@ -39,7 +39,7 @@ _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "
 # Packets ahead that are accepted without the host's clock; beyond, both clocks must agree.
 _MAX_BLIND = 4
 _MAX_DISAGREEMENT_NS = 20_000_000
-# A scan with more of its packets lost is not worth looking at.
+# Minimum share of a scan's packets that must arrive.
 _MIN_COVERAGE = 0.5
 
 
@@ -118,7 +118,7 @@ class Vlp16Stream:
             )
         self.product = product
         self._sensor = sensor
-        # Of the sensor's counter since the first packet; hours are counted on, and steps excluded.
+        # Time of the sensor's counter since the first packet, ns; hours are added, and steps excluded.
         self._elapsed_ns = 0
         self._last: DataPacket | None = None
         import velodyne_decoder  # type: ignore[import-untyped]
@@ -144,7 +144,7 @@ class Vlp16Stream:
         return [loss for loss in self.losses.findings() if loss.code in kinds]
 
     def push_position(self, payload: bytes | memoryview) -> None:
-        """Take a position packet; a bad one is counted."""
+        """Decode a position packet; a bad one is counted."""
         try:
             self.clock.position = read_position_packet(payload)
         except BadPacketError as error:
@@ -153,7 +153,7 @@ class Vlp16Stream:
         self.n_position += 1
 
     def push_data(self, payload: bytes | memoryview, host_ns: int) -> Scan | None:
-        """Take a data packet; returns the scan that it completes. A bad one is counted.
+        """Decode a data packet; return the scan that it completes. A bad one is counted.
 
         Args:
             payload: of the UDP packet.
@@ -289,7 +289,7 @@ class Vlp16Stream:
             Of the points in the order of firing: (N, 3) float32 m in frame lidar; (N,) float32 reflectivity,
             0 to 255; (N,) int16 ring, 0 = lowest; (N,) int64 ns after the first packet's first firing.
         """
-        # The library completes the hour by the host's time: a clock that agrees past the hour will do.
+        # The library completes the hour from the host's time, so a clock that agrees past the hour is enough.
         zero_s = 3600.0 + int(packets["us"][0]) * 1e-6
         vector = self._library.PacketVector()
         for packet, at_ns in zip(packets, start_ns, strict=True):

@@ -274,7 +274,7 @@ def explain(error: ValidationError, document: Document, schema: type[BaseModel] 
 
 
 def _problem(detail: ErrorDetails, schema: type[BaseModel]) -> tuple[KeyPath, str, KeyPath | None]:
-    """Give a problem's key, its words, and the valid key that an unknown one probably stands for."""
+    """Return a problem's key, its text, and the valid key that an unknown one probably stands for."""
     path = tuple(part for part in detail["loc"] if part != "[key]")
     kind, context = detail["type"], detail.get("ctx", {})
     # Bounded: repr() would write nested aliases out.

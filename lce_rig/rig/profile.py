@@ -52,7 +52,7 @@ OutputFormat = Literal[
 
 
 def _isaac_is_urdf(formats: Any) -> Any:
-    """Put the URDF in place of `isaac`, its other name in earlier versions."""
+    """Replace `isaac`, an earlier version's name, by the URDF format."""
     if not isinstance(formats, list | tuple) or "isaac" not in formats:
         return formats
     others = [name for name in formats if name != "isaac"]

@@ -188,7 +188,7 @@ class LidarSettings(Settings):
         } | values
 
     def data_sheet(self) -> DataSheet | None:
-        """Give the model's data sheet, with the profile's own beams; None where beams are not known."""
+        """Return the model's data sheet, with the profile's own beams; None if the beams are unknown."""
         sheet = find_data_sheet(self.model)
         if sheet is None and self.elevations_deg is None:
             return None
@@ -315,7 +315,7 @@ class CameraSettings(Settings):
         return self
 
     def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
-        """Name the first channel of a kind; None if there is none."""
+        """Return the first channel of a kind, or None."""
         return next((name for name, channel in self.channels.items() if channel.kind == kind), None)
 
     def with_intrinsics(self, lens: Intrinsics) -> "CameraSettings":

@@ -172,7 +172,7 @@ def _pattern(sheet: DataSheet, starts_ns: NDArray[np.int64]) -> tuple[Array, Arr
 class LidarModel:
     """The geometry and timing of a LiDAR at one rate.
 
-    Of one without rings, each firing of a scan is a laser of its own.
+    For a LiDAR without rings, each firing of a scan is a laser of its own.
 
     Attributes:
         name: of the model.

@@ -22,7 +22,7 @@ _NOISE_STREAM = 102
 class LiveScene:
     """Renders images and scans of a moving board.
 
-    Of a board that is held, images are rendered and beams are traced once; each image and scan has its own
+    For a held board, images are rendered and beams are traced once; each image and scan has its own
     noise. On its way, when nothing is captured, both are drafts: images without shadows and anti-aliasing,
     infinitely thin beams.
 

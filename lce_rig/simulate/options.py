@@ -54,7 +54,7 @@ class LidarNoise:
 
     @classmethod
     def of(cls, sheet: DataSheet) -> "LidarNoise":
-        """Take the errors from a data sheet; how ranges depend on brightness is a VLP-16's for all models."""
+        """Read the errors from a data sheet; the range error by brightness is a VLP-16's for all models."""
         return cls(
             range_sigma_m=sheet.range_sigma_m,
             laser_sigma_m=sheet.laser_bias_sigma_m,

@@ -120,7 +120,7 @@ class Mesh:
     triangles: NDArray[np.uint32]
 
     def moved(self, T_a_b: Array) -> "Mesh":
-        """Take the mesh from frame b to frame a."""
+        """Transform the mesh from frame b to frame a."""
         return Mesh(transform(T_a_b, self.vertices), self.normals @ T_a_b[:3, :3].T, self.triangles)
 
 

@@ -32,7 +32,7 @@ from lce_rig.rig import QualitySettings
 #: Events older than this no longer show in the network's image.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
-# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
+# Share of a DAVIS346's image taken by a board of 0.8 x 0.6 m at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
 # Poses nearer in time than this do not determine a speed.
@@ -106,7 +106,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
         return measured
     since_s = time_s - time_s.mean()
     share = since_s / np.sum(since_s**2)
-    # By time, of the pose's tangent: translation in m, rotation in rad.
+    # Velocity of the pose's tangent: translation in m/s, rotation in rad/s.
     velocity = share[1:] @ difference(track, found.T_cam_board)
     cov = np.einsum("k,kij->ij", share**2, np.concatenate([found.cov[None], track_cov]))
     speed_mps, speed_sigma_mps = _length(velocity[:3], cov[:3, :3])

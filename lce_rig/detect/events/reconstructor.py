@@ -62,7 +62,7 @@ class ReconstructionModel:
         self._multiple = math.lcm(*(divisor for _, divisor in self._states))
 
     def initial_states(self, height_px: int, width_px: int) -> States:
-        """Make the states before the first window for a sensor of this size: zeros."""
+        """Return the states before the first window for a sensor of this size: zeros."""
         height, width = self._padded(height_px), self._padded(width_px)
         return tuple(
             np.zeros((1, n_channels, height // divisor, width // divisor), np.float32)
@@ -125,14 +125,14 @@ def _bounds(picture: FloatArray) -> NDArray[np.float64]:
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
 
 
-# A window emptier than this is judged together with the one before it: too few events make noise, not edges.
+# Minimum fill of a window judged alone, not with the previous one: too few events make noise, not edges.
 _MIN_FILL = 0.5
 # Nothing happens in a longer silence: it is passed over in one stride, states kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
 # A stream cut off at the timestamp ends with its last event, a little before.
 _MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
-# Steps until the states have settled, on a real DAVIS346 recording.
+# Number of steps until the states have settled, on a real DAVIS346 recording.
 N_WARM_UP = 12
 
 
@@ -203,7 +203,7 @@ class Reconstructor:
                 yield READ_OUTSIDE_EVENTS.refusal(gap_s=1e-9 * late_ns)
 
     def feed(self, events: Events) -> None:
-        """Take the next events of a stream that runs on; `picture_at` gives its images.
+        """Add the next events of a continuing stream; `picture_at` returns its images.
 
         Args:
             events: up to the next timestamp that an image will be asked for, or shorter.
@@ -302,6 +302,6 @@ class Reconstructor:
     def _picture(
         self, events: Events, start_ns: int, end_ns: int, states: States
     ) -> tuple[FloatArray, States]:
-        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        """Compute the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
         voxels = normalise_voxels(voxel_grid(events, self._model.n_bins, start_ns, end_ns))
         return self._model.step(voxels, states)

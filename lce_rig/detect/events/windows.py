@@ -11,7 +11,7 @@ from lce_rig.core.data import Events
 # Events per pixel and step: the network's training value, and E2VID's usual one.
 _EVENTS_PER_PIXEL = 0.35
 BLOCK_PX = 16
-# Share of the sensor that takes part in a usual scene with the camera moving; see `active_share`.
+# Share of active pixel blocks in a typical scene with the camera moving; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
 _LONGEST_NS = 60_000_000
@@ -203,7 +203,7 @@ def without_background_activity(events: Events) -> Events:
 
 
 _BIN_NS = 1_000_000
-# Of recordings under mains lamps 0.83 to 0.86, of others 0.11 to 0.28.
+# Limit of coherence: recordings under mains lamps have 0.83 to 0.86, others 0.11 to 0.28.
 _FLICKER_COHERENCE = 0.5
 
 

@@ -18,12 +18,12 @@ Grey = NDArray[np.uint8]
 _WIDE_PX = 700
 _SEARCH_PX = 640
 _MOST_SCALE = 1.5
-# Saddle points that are looked at, and about how far edges reach around them, in the image that is searched.
+# Number of saddle points examined, and approximate reach of their edges, px of the searched image.
 _MOST_SADDLES = 220
 _SADDLE_SIGMA_PX = 1.2
-# Cosine of the angle between a corner's edge and the way to its neighbour, at least.
+# Minimum cosine of the angle between a corner's edge and the direction to its neighbour.
 _ALONG = 0.94
-# Neighbours are alike: in the strength of their saddles, and in how far apart they are along a row.
+# Maximum ratios between neighbours: strength of their saddles, spacing along a row.
 _MOST_STRONGER = 2.5
 _MOST_LONGER = 1.7
 _WAYS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -165,7 +165,7 @@ def resize(grey: Grey, scale: float) -> Grey:
 
 
 def to_full_scale(corners: NDArray[Any], scale: float) -> Array:
-    """Take corners of an image at a scale to (N, 2) px of the whole one."""
+    """Convert corners of a scaled image to (N, 2) px of the full one."""
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
 

@@ -153,7 +153,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = n_border
     parameters.minMarkerPerimeterRate = 0.015
-    # Of tags with modules of 2 px, these find seven times as many as OpenCV's defaults.
+    # Finds seven times as many tags with modules of 2 px as OpenCV's defaults.
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.errorCorrectionRate = 1.0
@@ -170,15 +170,15 @@ def _noise(grey: Grey) -> float:
     """Estimate the standard deviation of an image's noise, by its second differences across both axes."""
     across = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     rough = cv2.filter2D(grey, cv2.CV_16S, across)[1:-1:3, 1:-1:3]
-    # Of normal noise, the median size is 0.67 standard deviations; the filter multiplies these by six.
+    # The median magnitude of normal noise is 0.67 standard deviations; the filter multiplies these by six.
     return float(np.median(np.abs(rough))) / (0.6745 * 6)
 
 
 def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
-    """Name the dictionary of which the image has more markers than the board's n_own; None if none has."""
+    """Find a dictionary with more markers in the image than the board's n_own; None if there is none."""
     own = _family(board.dictionary)
     best, most = "", max(n_own, 3)
-    # The largest of a family holds the markers of the smaller ones.
+    # The largest dictionary of a family includes the markers of the smaller ones.
     for name in DICTIONARIES:
         if not name.endswith(("_50", "_100", "_250")) and _family(name) != own:
             n_seen = max(len(_detect(grey, name, 1.0, n_border)) for n_border in (1, 2))
@@ -189,7 +189,7 @@ def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
 
 
 def _family(dictionary: str) -> str:
-    """Name a dictionary without its size, as "5X5" of 5X5_100; each of AprilTag's is a family of its own."""
+    """Return a dictionary's name without its size, as "5X5" of 5X5_100; each AprilTag one is a family."""
     return dictionary.partition("_")[0] if dictionary[0].isdigit() else dictionary
 
 
@@ -250,7 +250,7 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
         return float(np.sum((cv2.perspectiveTransform(on_board[None], H)[0] - flat) ** 2))
 
     found = minimize_scalar(misfit, bounds=_GAP_SHARES, method="bounded")
-    # Eight of a homography, and the gap.
+    # Nine unknowns: eight of a homography, and the gap.
     variance = found.fun / (2 * len(flat) - 9)
     is_other = misfit(board.gap_share) - found.fun > _GAP_SIGMAS**2 * variance
     return float(found.x) if is_other and abs(found.x - board.gap_share) > _MAX_GAP_OFF else None
@@ -292,7 +292,7 @@ def _measure(
             return None, 0
         crossings = fit_crossings(grey, grid_px, patches=marked_patches(board, intrinsics, T_cam_board))
         is_seen = _as_printed(grey, crossings, signs)
-        # The better half of them is hardly covered: they alone give the first pose.
+        # The better half of them is hardly covered, so it alone determines the first pose.
         usual = np.median(crossings.misfit[is_seen]) if is_seen.any() else 0.0
         is_trusted = is_seen & (crossings.misfit <= usual)
         for _ in range(3):
@@ -341,7 +341,7 @@ def marked_patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> 
     if board.type == "charuco":
         unit_m, clear_m = board.square_m, _FREE * (1 - board.marker_share) / 2 * board.square_m
     else:
-        # The next corner lies a gap away; a border of one module of eight is the narrowest.
+        # The next corner is a gap away; a border of one module of eight is the narrowest.
         unit_m, clear_m = _FREE * board.gap_share * board.square_m / REACH, _FREE * board.square_m / 8
     corners, shape = board.corners(), (board.rows, board.cols, 2)
     right, down = (

@@ -28,9 +28,9 @@ LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
 LEAST_MARKED_PX = 20.0
 """Least side of a square with a marker, or of a tag, from which markers are read without fail."""
-# Of camera images: least difference of black and white, grey values, and fewest edge widths in a square.
+# Limits of camera images: least difference of black and white, grey values; fewest edge widths in a square.
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
-# Of images without a board: least grey spread, and widest of the strongest edges.
+# Limits of images without a board: least grey spread, and greatest width of the strongest edges.
 _MIN_SPREAD, _MAX_EDGE_PX = 50.0, 6.0
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
@@ -83,7 +83,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     """
     wide = _widened(_widened(grid_px))
     height, width = grey.shape
-    # Pixels beyond the border repeat its value, which alternates with nothing.
+    # Pixels beyond the border repeat its value, and so do not alternate.
     values = square_values(grey, np.clip(wide, 0, [width - 1, height - 1]))
     signs = (-1.0) ** np.indices(values.shape).sum(axis=0)
     inner = _alternation(values[2:-2, 2:-2], signs[2:-2, 2:-2])

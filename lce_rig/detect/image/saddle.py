@@ -13,10 +13,10 @@ from lce_rig.core.geometry import Array
 # next corners stay outside.
 REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
-# Of the patches that bring corners to where the final ones need few steps; those take most of the time.
+# Samples per side and steps of a first, coarse fit; it saves steps of the final one, which is slower.
 _COARSE_SAMPLES = 9
 _COARSE_STEPS = 6
-# Of samples farther apart the image is blurred before.
+# Spacing of samples from which the image is blurred first, px.
 _FAR_APART_PX = 1.3
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
@@ -178,7 +178,7 @@ def _fit(
 
     `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
     """
-    # Without a start the corners are in the middles of their patches.
+    # Without a start the corners are assumed in the middles of their patches.
     mean = values.mean(axis=1)
     p, lowest = np.zeros((len(values), 8)), np.log(least_sigma_px / height_px)
     p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
@@ -189,7 +189,7 @@ def _fit(
     damping = np.full(len(p), 1e-2 if start is None else 1e-4)
     residuals, J = _model(p, values, a, b)
     cost = np.sum(residuals**2, axis=1)
-    k = np.arange(len(p))  # Those that are not done.
+    k = np.arange(len(p))  # Fits that are not done.
     for _ in range(n_steps):
         J_k = J if len(k) == len(p) else J[k]
         # Blurs at their bounds that would go beyond stay there: the others then settle in few steps.

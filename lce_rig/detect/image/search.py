@@ -33,18 +33,18 @@ from lce_rig.rig import QualitySettings
 
 STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
-"""Of a search that was not thorough."""
+"""Hint of a search that was not thorough."""
 
-# A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
+# Maximum excess of a canvas over the sensor, in sizes of the sensor; a larger one costs memory.
 _CANVAS_FRACTION = 3.0
-# Corners that the finder misplaced, or that an artefact covers, at most.
+# Maximum share of corners that the finder misplaced, or that an artefact covers.
 _MAX_MISPLACED = 0.08
 # A quarter of a full fit's time; the corners' standard deviation is then 0.03 px, sufficient for stillness
 # and guidance.
 _FOLLOWED_SAMPLES = 13
-# A board whose corners have moved by less stands still.
+# Maximum movement of a still board's corners, px.
 _RESTING_PX = 0.5
-# A grid of corners with a smaller measurable fraction is rejected.
+# Minimum measurable fraction of a grid's corners.
 _MIN_FITTED = 0.5
 
 

@@ -23,10 +23,10 @@ from lce_rig.detect.lidar.template import (
 
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
-_MAD = 1.4826  # the standard deviation of normal noise over its median size
+_MAD = 1.4826  # standard deviation of normal noise over its median magnitude
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
-_MIN_SMEARED = 8  # ring ends, fewest whose scatter measures a smear: a fit takes five freedoms
-_CROSSING = 0.3  # least part of its gaps by which a ring crosses a side, for ends that show a smear
+_MIN_SMEARED = 8  # minimum number of ring ends to measure a smear: a fit takes five freedoms
+_CROSSING = 0.3  # minimum share of its gaps by which a ring crosses a side, for ends that show a smear
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # maximum distance of a measured border from the nominal one
 
@@ -52,14 +52,14 @@ class RingEnds(NamedTuple):
 
 
 def median(values: Array) -> float:
-    """Take the median: on a few hundred values several times faster than `numpy.median`."""
+    """Compute the median: on a few hundred values several times faster than `numpy.median`."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     ordered = np.sort(values)
     return float(ordered[low] + ordered[high]) / 2
 
 
 def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
-    """Take the first and last board return of each ring and look at the beams beyond them.
+    """Find the first and last board return of each ring and examine the beams beyond them.
 
     Args:
         scan: all returns.
@@ -326,7 +326,7 @@ def build_board(
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
     away = placement.distance_m(view.uv)
-    # A plate somewhat larger than it should be is to be measured, not cut to size.
+    # A slightly larger plate is measured at its full size, not cut to the nominal one.
     ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
     fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
     away = fitted.distance_m(view.uv)

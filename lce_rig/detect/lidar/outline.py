@@ -23,13 +23,13 @@ from lce_rig.detect.lidar.template import Placement
 
 N_ANGLES = 9
 _OUTLIERS = 0.02
-# Rays farther from the border say nothing of its place.
+# Distance from the border beyond which rays do not locate it, m.
 _BAND_M = 0.10
 # Blurs of the first rounds, which catch a start that is off; wider ones for a plate that is only about there.
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
-# Share of rays that contradict a clear plate's placement.
+# Maximum share of rays that contradict a clear plate's placement.
 _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
@@ -115,7 +115,7 @@ def fit_outline(
         blur = np.maximum(blur_m(placement.axes), least)
         p, slopes = _probability(local, half + x[3:], blur)
         is_on = rays.is_on[near]
-        # By u, v, angle and growth; the shift is counted along the rectangle's axes.
+        # In the order u, v, angle, growth; the shift is along the rectangle's axes.
         right, left, top, bottom = slopes
         by_x, by_y = right - left, top - bottom
         turned = by_x * local[:, 1] - by_y * local[:, 0]

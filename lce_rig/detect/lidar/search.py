@@ -33,7 +33,7 @@ from lce_rig.detect.lidar.template import (
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
 SCATTER_M = 0.02  # scatter added to the LiDAR's noise in the search for plates to name
-# Sum of |log| of the ratios of long and short side up to which a plate is worth naming.
+# Maximum sum of |log| of the ratios of long and short side for a plate to be named.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
@@ -145,7 +145,7 @@ def other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
 
 
 MAX_CANDIDATES = 4
-# A plate with as many rings and as little else in its plane is clear.
+# Limits of a clear plate: minimum rings, maximum share of other returns in its plane.
 CLEAR_RINGS = 6
 CLEAR_SHARE = 0.05
 # Share of returns beyond the outline from which, beside a clear board, a plate is a patch of a wall.
@@ -243,7 +243,7 @@ def measure_plate(
         return None
     n_rings, distance_m = measured.quality.n_rings, measured.quality.distance_m
     if n_rings < limits.min_rings:
-        # The number of rings goes with 1 / distance.
+        # The number of rings is proportional to 1 / distance.
         closer_m = max(0.1, distance_m * (1.0 - n_rings / limits.min_rings))
         return LIDAR_TOO_FEW_RINGS.refusal(
             n_rings=n_rings, min_rings=limits.min_rings, distance_m=distance_m, closer_m=closer_m
@@ -263,7 +263,7 @@ def _past_dark_squares(
 ) -> tuple[PlaneView, Placement] | None:
     """Register the outline of a board whose dark squares, grazed by beams, return nothing or too far off.
 
-    Such beams say nothing about the outline; the others must fit it as without noise. Of boards at 42 to
+    Such beams do not locate the outline; the others must fit it as without noise. Of boards at 42 to
     66 deg before a VLP-16 and a VLP-32C, 12 to 41 % of the beams are lost; of walls and tables at most 9 %.
 
     Args:

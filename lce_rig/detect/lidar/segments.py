@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 Indices = NDArray[np.intp]
 Floats = NDArray[np.float32]
 
-# The board is found up to this angle between its normal and the beam; more is not a useful view.
+# Maximum angle between the board's normal and the beam, rad; more is not a useful view.
 MAX_INCIDENCE_RAD = np.radians(70.0)
 MIN_POINTS = 4  # returns that make a segment
 MAX_STEPS = 3.6  # firings from one return to the next on the same surface; dark squares drop single ones
@@ -158,7 +158,7 @@ def _azimuth_step(turn: Floats) -> float:
         return 0.0
     middle = float(np.median(forward[:: 1 + len(forward) // 1000]))
     common = forward[np.abs(forward - middle) < 0.3 * middle]
-    # Of a few returns, such as are left about where a board was, two steps may have nothing in common.
+    # Among a few returns, such as those left about a board's place, two steps may have nothing in common.
     return float(np.mean(common, dtype=np.float64)) if len(common) else middle
 
 

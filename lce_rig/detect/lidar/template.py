@@ -89,7 +89,7 @@ class Placement:
         return np.array([[cosine, sine], [-sine, cosine]])
 
     def local(self, uv: Array) -> Array:
-        """Take points (..., 2) of the plane view to the rectangle's axes, m."""
+        """Convert points (..., 2) of the plane view to the rectangle's axes, m."""
         return np.asarray((uv - [self.u_m, self.v_m]) @ np.ascontiguousarray(self.axes.T))
 
     def distance_m(self, uv: Array) -> Array:
@@ -351,7 +351,7 @@ def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]
 
 
 def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float], scale_m: float) -> Array:
-    """Take one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
+    """Compute one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
     residual, x, y, away = _residuals(state, samples, kind, half)
     weight = (residual != 0) / (1.0 + (residual / scale_m) ** 2) ** 2
     over_x, over_y = np.abs(x) - half[0], np.abs(y) - half[1]
@@ -359,7 +359,7 @@ def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float]
     is_outside, scale = away > 0, np.maximum(away, 1e-12)
     along_x = np.copysign(np.where(is_outside, np.maximum(over_x, 0.0) / scale, over_x > over_y), x)
     along_y = np.copysign(np.where(is_outside, np.maximum(over_y, 0.0) / scale, over_x <= over_y), y)
-    # The shift is counted along the rectangle's axes, which spares turning every gradient.
+    # The shift is along the rectangle's axes, which saves rotating every gradient.
     jacobian = np.empty((*residual.shape[:2], 3, residual.shape[2]))
     np.negative(along_x, out=jacobian[:, :, 0])
     np.negative(along_y, out=jacobian[:, :, 1])

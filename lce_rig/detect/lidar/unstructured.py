@@ -43,9 +43,9 @@ from lce_rig.detect.lidar.search import (
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Floats
 from lce_rig.detect.lidar.template import Placement, PlaneView, plane_axes, view_plane
 
-# Cells per short side of the board: of 6 cm for a plate of 0.63 m.
+# Cells per short side of the board: 6 cm for a plate of 0.63 m.
 _CELLS = 10.0
-# Accumulated point clouds hold millions of points: enough of them find the plates, and measure one.
+# Maximum points used of an accumulated cloud, which holds millions: to find plates, and to measure one.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
 # Number of returns, or of rays, for a first estimate of plane and outline; all of them locate both.
 _ROUGH = 6_000
@@ -54,29 +54,29 @@ _MOST_PATCHES = 8
 _ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
-_NOISE_M = 0.012  # of a plane's returns, at most before the noise of the cloud itself is measured
+_NOISE_M = 0.012  # maximum noise of a plane's returns, assumed until the cloud's own is measured
 _SURROUND_M = 0.25
 _MIN_POINTS = 60
-# Directions of a rosette's beams err by about this much.
+# Approximate error of the directions of a rosette's beams, rad.
 _DIRECTION_RAD = 7e-4
-# Share of the plate without any return from which it reaches out of the field of view.
+# Share of the plate without returns from which it reaches out of the field of view.
 _DARK_SHARE = 0.08
 _BEHIND_M, _FOOT_M = 0.05, 0.15
 # Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
-# Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
+# Limits of another plate: share of rays that contradict the best placement, and growth of the outline.
 _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
-# Rays farther beyond a located border should pass the plate.
+# Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
 # Maximum blur of a still board's border, m (5 mm at most on recordings); a wider border counts by its width.
 _MOST_SMEAR_M = 0.008
 # Parts, in order of time, to detect that a plate moved, and the limit of their chi2 (6 freedoms, p = 1e-4).
 _N_PARTS, _MOVED_CHI2 = 4, 27.9
-# Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
+# Minimum number of located places on upright and on level edges, and of means on the plate, to fix its pose.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
 
 
@@ -179,7 +179,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     count = np.bincount(label)
     large = np.flatnonzero(count >= 8)
     large = large[np.argsort(-count[large], kind="stable")]
-    # Each cell counts alike: a rosette is densest in its middle.
+    # Each cell has the same weight: a rosette is densest in its middle.
     alike = sums / sums[:, :1]
     totals = [np.bincount(label, column, n_patches)[large] for column in alike.T]
     return Plates.of(np.array(totals, dtype=np.float64).T, np.zeros(len(large), dtype=np.intp))

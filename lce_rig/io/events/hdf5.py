@@ -70,7 +70,7 @@ class Hdf5Events(EventStream):
 
 
 def _pixels(numbers: NDArray[Any]) -> NDArray[np.uint16]:
-    """Give columns or rows (N,) as 16 bits; numbers beyond stay off any sensor."""
+    """Convert columns or rows (N,) to 16 bits; larger numbers stay outside any sensor."""
     limit = 1 << 16
     return np.where((numbers >= 0) & (numbers < limit), numbers, limit - 1).astype(np.uint16)
 

@@ -132,7 +132,7 @@ class BagFile:
 
 
 def kind_of(path: Path) -> str:
-    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
+    """Return the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
 
     The suffix is in lower case, and that of the bag for a compressed one or one that was not closed.
     """
@@ -153,7 +153,7 @@ def _bag_files(folder: Path) -> list[Path]:
 
 @contextmanager
 def _plain(file: Path) -> Iterator[Path]:
-    """Yield a copy of a file that rosbags can open: decompressed, with its suffix in lower case.
+    """Yield a path of a file that rosbags can open: decompressed, with its suffix in lower case.
 
     Raises:
         ValueError: not a bag, or damaged.
@@ -181,7 +181,7 @@ def _plain(file: Path) -> Iterator[Path]:
 
 @cache
 def _bound_rosbags() -> None:
-    """Let rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
+    """Make rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
 
     The tables of decompressors are replaced, as theirs unpack a chunk before its size is checked.
     """
@@ -232,7 +232,7 @@ def _type_of(connection: Any) -> str:
 
 
 def _repair(path: Path) -> str:
-    """Name the tool that restores the index of a bag whose recorder was killed."""
+    """Return the tool that restores the index of a bag whose recorder was killed."""
     commands = {".bag": f"rosbag reindex {path.name}", ".mcap": f"mcap recover {path.name}"}
     folder = (path if path.is_dir() else path.parent).resolve()
     command = commands.get(kind_of(path), f"ros2 bag reindex {folder.name}")

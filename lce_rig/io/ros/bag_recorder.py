@@ -237,7 +237,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         except BaseException as error:
             self._failure = _not_writable(self.path, error)
             with suppress(OSError):
-                # Of rosbags before 0.11 nothing closes a file without trying to write the index.
+                # rosbags before 0.11 cannot close a file without trying to write the index.
                 getattr(self._writer, "abort", self._writer.close)()
             if isinstance(error, OSError):
                 raise self._failure from error

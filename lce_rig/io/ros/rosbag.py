@@ -142,7 +142,7 @@ class TopicDecoder:
         return to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns, self.notes)
 
     def _join(self) -> Scan:
-        """Put the scans that have accumulated together."""
+        """Join the accumulated scans."""
         parts, self._parts = self._parts, []
         first_ns = parts[0].stamp_ns or 0
         if len(parts) == 1:

@@ -60,7 +60,7 @@ class Target:
         return IMAGE_TYPES | EVENT_TYPES if self.has_events else IMAGE_TYPES
 
     def stream(self, msgtype: str) -> Stream:
-        """Name the stream that messages of this type make."""
+        """Return the stream of messages of this type."""
         if self.channel is None:
             return Stream(self.sensor, "", "scans")
         return Stream(self.sensor, self.channel, "events" if msgtype in EVENT_TYPES else "images")
@@ -123,7 +123,7 @@ def choose_topics(
         ]
         return fitting[0] if len(fitting) == 1 else ""
 
-    # The only topic of its kind is taken where the profile names none.
+    # If the profile names no topic, the only one of the right kind is used.
     for target, profile_topic in targets.items():
         topic = only(EVENT_TYPES)
         if topic and target.has_events and profile_topic is None and target not in chosen.values():
@@ -134,7 +134,7 @@ def choose_topics(
         if not of_kind or set(of_kind) & set(chosen.values()):
             continue
         target, profile_topic = of_kind[0], targets[of_kind[0]]
-        # Packets are read where a driver's point clouds of them were not recorded.
+        # Packets are read if the bag lacks the driver's point clouds of them.
         topic = only(target.types & CLOUD_TYPES) or only(target.types)
         if profile_topic is None and topic:
             take(target, topic, f", the only topic with {what}")
@@ -314,7 +314,7 @@ def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[Se
 
 
 def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
-    """Name the camera_info topic of an image's topic; None if there is none.
+    """Return the camera_info topic of an image's topic, or None.
 
     Drivers put it beside the image, also with the same beginning (left_camera_info for left_image), or below.
     """

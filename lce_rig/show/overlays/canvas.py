@@ -30,7 +30,7 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PN
 
 
 def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
-    """Make a BGR copy of an image, enlarged by a whole factor to at least `min_width_px`.
+    """Copy an image to BGR, enlarged by a whole factor to at least `min_width_px`.
 
     Returns:
         The copy (H, W, 3) and the factor; a pixel at u lies at (u + 0.5) factor - 0.5 in it.

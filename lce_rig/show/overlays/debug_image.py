@@ -25,7 +25,7 @@ _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
 _DIM = 0.45
 _DPI, _WIDTH_IN, _PANE_IN = 100, 16, 5.9
-# Of a line that the board was found, and of a refusal with its action.
+# Height, inches: of a line that the board was found, and of a refusal with its action.
 _FOUND_IN, _REFUSED_IN = 0.5, 1.5
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"

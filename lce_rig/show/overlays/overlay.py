@@ -293,7 +293,7 @@ def _draw(
 
 
 def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
-    """Put a camera in the first LiDAR's place that looks at the boards.
+    """Describe a camera at the first LiDAR's place that looks at the boards.
 
     Args:
         check: of two LiDARs.

@@ -79,7 +79,7 @@ class CameraIn3D:
     T_cam_lidar: Array
 
     def frustum(self) -> tuple[Array, NDArray[np.int32]]:
-        """Give camera and corners (5, 3) of its field of view, frame lidar, and the lines (8, 2) between."""
+        """Return the camera and its field of view's corners (5, 3), frame lidar, and the lines (8, 2)."""
         rays = self.lens.unproject(outermost_pixels(self.lens))
         corners = np.concatenate([np.zeros((1, 3)), _FRUSTUM_M * rays])
         edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 4), (4, 3), (3, 1)]

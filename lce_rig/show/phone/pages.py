@@ -28,10 +28,10 @@ from lce_rig.core.geometry import Array
 
 Pixels = NDArray[np.uint8]
 
-#: Enough for a phone, and little enough for its radio.
+#: Maximum width of the image, px: sharp enough on a phone, small enough for its radio link.
 MAX_WIDTH_PX = 960
 _QUALITY = 75
-# A collection runs for hours; the page shows the last of its messages.
+# Messages on the page: a collection runs for hours, only the last ones are shown.
 _MAX_LOG = 50
 
 
@@ -131,10 +131,10 @@ _MOST_ASKED = 8
 _LOOK_S = 0.03
 #: Time between two updates, s.
 PERIOD_S = 0.1
-#: Without news the page gets a message this often, and so knows that it is still connected.
+#: Time without news after which the page gets a message, s, so that it sees the connection is alive.
 BEAT_S = 1.0
 MAX_MESSAGE_BYTES = 256
-#: A page that answers nothing for so long sleeps, or is out of range; it connects again when it wakes.
+#: Time without an answer after which a page sleeps or is out of range, s; it reconnects when it wakes.
 ANSWER_S = 5.0
 _GOODBYE_S = 0.5
 _COOKIE = "lce_rig_preview"
@@ -158,12 +158,12 @@ class Feed:
         self._asked: deque[TakeBack] = deque(maxlen=_MOST_ASKED)
 
     def publish(self, state: LiveState) -> None:
-        """Put a state in; from one thread at a time. It is a single assignment, so it never blocks."""
+        """Store a state; call from one thread only. It is a single assignment, so it never blocks."""
         number = 1 if self._newest is None else self._newest[0] + 1
         self._newest = (number, time.monotonic(), state)
 
     def ask(self, asked: TakeBack) -> None:
-        """Put a request of a page in, for the thread that collects; the oldest make way."""
+        """Queue a request of a page for the thread that collects; the oldest are dropped."""
         self._asked.append(asked)
 
     def asked(self) -> TakeBack | None:
@@ -171,7 +171,7 @@ class Feed:
         return self._asked.popleft() if self._asked else None
 
     def newest(self) -> tuple[int, LiveState] | None:
-        """Give the newest state and its running number, from 1; None before one has come."""
+        """Return the newest state and its running number, from 1; None before the first."""
         newest = self._newest
         return None if newest is None else (newest[0], newest[2])
 
@@ -225,7 +225,7 @@ class Viewer:
             await self._line.close(code=1008, message=b"only answers and requests are read")
 
     async def close(self) -> None:
-        """Let the page have the last state, for a moment, and close the connection."""
+        """Wait briefly until the page has the last state, and close the connection."""
         for _ in range(10):
             newest = self._feed.newest()
             if newest is None or newest[0] <= self._delivered:
@@ -292,7 +292,7 @@ class Pages:
         return app
 
     async def close(self) -> None:
-        """Let the pages have the last state, and close them."""
+        """Send the pages the last state, and close them."""
         closing = (viewer.close() for viewer in self._viewers)
         await asyncio.gather(*closing, return_exceptions=True)
         self.encoder.close()
@@ -306,7 +306,7 @@ class Pages:
         ):
             text = "This page needs the whole link that lce-rig shows, with its token.\n"
             answer = web.Response(status=403, text=text)
-            # Without the connection, strangers ask no faster than they are accepted.
+            # Closing the connection limits strangers to the rate of new connections.
             answer.force_close()
             return answer
         origin = request.headers.get("Origin", f"http://{request.host}")

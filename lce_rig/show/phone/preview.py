@@ -30,7 +30,7 @@ _INTERFACE = struct.Struct("16s20s")
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Take an address apart: "host:port", "host" or "port"; this computer alone and port 8765 by default.
+    """Parse an address: "host:port", "host" or "port"; this computer alone and port 8765 by default.
 
     Raises:
         UsageError: it is none of these.
@@ -153,7 +153,7 @@ class Preview:
         return 0 if self._pages is None else self._pages.encoder.n_encoded
 
     def close(self) -> None:
-        """Let open pages have the last state, and end."""
+        """Send open pages the last state, and stop."""
         if self._thread is None or self._loop is None or self._stop is None:
             return
         if self._thread.is_alive():

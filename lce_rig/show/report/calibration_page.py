@@ -79,7 +79,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
 
 
 def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) -> list[str]:
-    """Name a capture's overlays as `verify` of the session does."""
+    """Return the names of a capture's overlays, as written by `verify` of the session."""
     return [
         "/".join([folder, *([Pair(c.camera, channel, c.lidar).folder_name] if has_folders else []), name])
         for channel in c.channels or ("",)
@@ -219,7 +219,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
 
 
 _MOST_PX, _QUALITY, _OUTLINE_BGR = 320, 60, (0, 140, 255)
-# Events of this long make a picture in which the board's edges can be seen.
+# Length of the events in a picture, ns: enough to show the board's edges.
 _EVENTS_NS = 20_000_000
 
 

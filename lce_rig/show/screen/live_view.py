@@ -76,7 +76,7 @@ _STYLES: dict[Phase, str] = {
 _BELL_EVERY_S = 0.2
 _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
 _HEIGHT, _WIDTH = 24, 80
-# Bars and figures; the drawing stands beside them.
+# Width of bars and figures, characters; the drawing is beside them.
 _SIDE_WIDTH = 40
 # Written small in the headline, too: 8 M would be something else.
 _UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
@@ -301,7 +301,7 @@ def render(
     n_free = height - n_lines([title, Padding(banner, (0, 2)), *above, *below])
     n_newest, n_beside = n_lines([newest]), n_lines(side, _SIDE_WIDTH)
     n_room = n_free - n_newest - n_lines(notes[:1])
-    # The lines of a prediction are kept free until there is one: the drawing beside them keeps its size.
+    # The lines of a prediction are kept free before there is one, so that the drawing keeps its size.
     n_blank = max(min(n_room, len(_BARS) + 4) - n_beside, 0)
     side, n_beside = side + [Text(" ")] * n_blank, n_beside + n_blank
     edge = 1 if n_room - n_beside >= 2 else 0
@@ -311,7 +311,7 @@ def render(
     n_room = n_free - 2 * edge
     if height > _HEIGHT:  # the same size for any number of messages
         n_beside = max(min(height - 14, n_room - 3), n_beside)
-    # The newest message, notes, then older messages, as many as there is room for.
+    # The newest message, notes, then older messages, up to the free lines.
     n_left = n_room - n_beside - n_newest
     kept = []
     for part in [*notes, *older]:
@@ -329,7 +329,7 @@ def render(
 
 
 def _stream_table(streams: tuple[StreamState, ...]) -> Any:
-    """Lay the streams out: name, rate, losses, and figures of the board or the reason for a refusal."""
+    """Lay the streams out: name, rate, losses, and figures of the board or the fault."""
     from rich.table import Table
     from rich.text import Text
 
