@@ -177,7 +177,7 @@ class BoardFinder:
 def check_origin(scan: Scan) -> Refusal | None:
     """Refuse a scan whose rings meet far from the frame's origin, as one moved to the robot's frame.
 
-    Beams are taken to begin at the origin. From elsewhere, ring ends and ranges are wrong at every distance.
+    Beams are assumed to begin at the origin; otherwise ring ends and ranges are wrong at every distance.
     """
     if not np.any(scan.ring != NO_RING):
         return None

@@ -54,7 +54,7 @@ class ExportJob:
         rig: the profile the calibrations belong to.
         folder: for the files.
         robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
-        session: with the images and scans; None where only results are at hand.
+        session: with the images and scans; None if only results are available.
         findings: content that was left out of the outputs or put into another form, and why; grows.
     """
 
@@ -197,7 +197,7 @@ def export(
         rig: the profile the calibrations belong to.
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
-        is_forced: write failed calibrations too; every file then says so.
+        is_forced: write failed calibrations too; every file is then marked as failed.
         session: with images and scans, for formats that show them.
         robot: its own tree of frames, into which the outputs are to fit.
         findings: gets those about content that is left out or in another form.

@@ -1,6 +1,6 @@
 """Formats of other tools: Kalibr, direct_visual_lidar_calibration, FAST-LIVO2, OpenCV and Autoware.
 
-A camera model with more coefficients than a format has is replaced by the one that draws most alike.
+A camera model with more coefficients than a format has is replaced by the best-fitting one that it has.
 
 Autoware's kit frame is `sensor_kit_base_link`. A LiDAR's entry there is the base of its housing, from which
 its description leads to the frame of the points; a camera's is its body, `NAME/camera_link`.
@@ -259,9 +259,9 @@ class _Entry(NamedTuple):
 
 
 def export_autoware(job: ExportJob) -> list[Path]:
-    """Write Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml where base_link is known.
+    """Write Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml if base_link is known.
 
-    Without a frame `sensor_kit_base_link` in the robot's tree, the kit is where the first sensor's entry is.
+    Without a frame `sensor_kit_base_link` in the robot's tree, the kit is at the first sensor's entry.
     """
     paths = []
     for index, tree in enumerate(job.trees):

@@ -96,7 +96,7 @@ class RobotTree:
         Args:
             source: for messages.
             joints: in any order.
-            links: the frames, where the source lists them.
+            links: the frames, if the source lists them.
             has_one_root: whether it has to be one tree; else several, as static transforms make where others
                 change while the robot drives.
 

@@ -431,7 +431,7 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     """Run the target's command; return its output, or None without a command.
 
     Raises:
-        CommandError: it failed, or whether it did is not known; the files are in place.
+        CommandError: it failed, or its outcome is unknown; the files are in place.
     """
     if target.run is None:
         return None

@@ -257,7 +257,7 @@ class Registry:
                 return
 
     def set_aside(self, folder: str) -> None:
-        """Move a result below `SUPERSEDED`, where the table does not find it; numbered, if one is there.
+        """Move a result below `SUPERSEDED`, out of the table's sight; numbered, if one is there.
 
         Raises:
             SessionError: it cannot be written; the result stays.

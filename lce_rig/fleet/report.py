@@ -42,7 +42,7 @@ MOVED_COLUMNS = (
     *("verdict", "findings", "severities", "T_cam_lidar", "cov", "cov_shared"),
 )
 """Columns of the table that this module requires."""
-# Sensors that moved far from the CAD model fail by this; other errors say that the result is wrong.
+# Error of sensors far from the CAD model, whose results are usable; other errors mark them as wrong.
 _FAR = "verdict.far_from_nominal"
 # 0.01 mm and 0.0006 deg, so that a covariance of zeros can be inverted.
 _LEAST = 1e-10 * np.eye(6)

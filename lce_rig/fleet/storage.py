@@ -124,7 +124,7 @@ class Storage:
     def folders_with(self, marker: str) -> list[str]:
         """List the outermost folders below it that hold a file of this name, by their path in it.
 
-        The folder itself is "". Folders whose names begin with a dot are left out.
+        The folder itself is "". Folders whose names begin with a dot are skipped.
         """
         folders = []
         with self.reached() as (fs, path):
@@ -174,7 +174,7 @@ class Storage:
 
         Args:
             target: the copy, which must not exist.
-            without: names in the folder that are left out.
+            without: names in the folder that are skipped.
 
         Raises:
             OSError: it is not there, or cannot be written here.

@@ -105,7 +105,7 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
 
 
 def suggest_models(elevations_deg: Array) -> list[str]:
-    """List the models whose beams have these elevations (L,) in deg, the most alike first."""
+    """List the models whose beams have these elevations (L,) in deg, the most similar first."""
     n = len(elevations_deg)
     alike = []
     for sheet in DATA_SHEETS:

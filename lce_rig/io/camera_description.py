@@ -185,7 +185,7 @@ def describe_message(info: Any) -> CameraDescription:
     """Read the fields of a sensor_msgs/CameraInfo of ROS 1 or ROS 2.
 
     Raises:
-        ValueError: a field is not as it has to be.
+        ValueError: a field is invalid.
     """
     names = ("distortion_model", "width", "height", "binning_x", "binning_y", "k", "d", "p", "r")
     fields = {name: getattr(info, name, None) for name in names}

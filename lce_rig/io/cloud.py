@@ -47,7 +47,7 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
         points_lidar: (N, 3) m, frame lidar (z along the axis of rotation); NaN for a missing return.
 
     Returns:
-        (N,) int16; -1 where the point is not finite or lies at the origin.
+        (N,) int16; -1 for a point that is not finite or at the origin.
 
     Raises:
         SourceError: the elevations form no rings, as with a solid-state LiDAR or a point cloud that was
@@ -127,7 +127,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
         count = np.maximum(np.bincount(ring, minlength=n), 1)
         mean_x, mean_y = np.bincount(ring, x, n) / count, np.bincount(ring, y, n) / count
         dx, dy = x - mean_x[ring], y - mean_y[ring]
-        # A prior holds the offset at zero where a ring sees a single distance (0.1 mrad against 15 mm).
+        # A prior keeps the offset near zero for a ring that sees a single distance (0.1 mrad against 15 mm).
         prior = (1e-4 / MAX_OFFSET_M) ** 2 * count
         offset = np.bincount(ring, dx * dy, n) / (np.bincount(ring, dx * dx, n) + prior)
         offset = np.clip(offset, -MAX_OFFSET_M, MAX_OFFSET_M)
@@ -348,7 +348,7 @@ def _times(
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns
-    # velodyne_pointcloud gives times relative to the timestamp: negative where that marks the last packet.
+    # velodyne_pointcloud gives times relative to the timestamp: negative if it marks the last packet.
     return offset_ns, stamp_ns + first_ns
 
 

@@ -160,10 +160,10 @@ def list_files(folder: Path) -> tuple[list[Path], list[Path]]:
 def _list(
     folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
 ) -> list[Path]:
-    """List the files of one kind in the folder whose name says so, else in the only one that has any.
+    """List the files of one kind in the folder named for it, else in the only one that has any.
 
     Raises:
-        SourceError: there are none, or several folders have some and no name says which is meant.
+        SourceError: there are none, or several folders have some and none is named for them.
     """
     folders = _folders(folder)
     holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
@@ -275,7 +275,7 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     """List the images of each camera.
 
     Raises:
-        SourceError: there are none, or none of the camera that was asked for, or their camera is not known.
+        SourceError: there are none, or none of the requested camera, or their camera is not known.
     """
     found = _by_sensor(folder, rig.cameras, IMAGE_FOLDERS, SUFFIXES) if len(rig.cameras) > 1 else {}
     if options.camera in found:

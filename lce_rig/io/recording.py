@@ -117,7 +117,7 @@ def choose_camera(
     camera = camera or options.camera
     if camera is None:
         camera, *others = rig.cameras
-        if others:  # Images of one that are taken for another's would spoil both extrinsics.
+        if others:  # Images assigned to the wrong camera would spoil both extrinsics.
             raise SourceError(
                 f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
                 f"Name it with --camera {camera}, or put each camera's images into a folder of its name: "
@@ -394,7 +394,7 @@ class JoinedRecording:
             self.notes += [n for part in self._parts for n in part.notes if n not in self.notes]
 
     def _owned(self, part: ContinuousRecording) -> Iterator[Sample]:
-        """Yield the samples of the streams that are taken from a part."""
+        """Yield the samples of the streams that are read from a part."""
         return (
             sample for sample in part.samples() if self._owner.get(stream_of(sample, self._rig), part) is part
         )

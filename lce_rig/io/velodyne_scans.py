@@ -93,7 +93,7 @@ class Vlp16Stream:
         n_data, n_position: data and position packets that passed the checks.
         n_scans: revolutions handed on.
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
-        product: the model whose packets are taken.
+        product: the model whose packets are decoded.
         other_models: data packets of other models, by name.
         clock: of the timestamps.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
@@ -219,7 +219,7 @@ class Vlp16Stream:
         return "after a step"
 
     def _add(self, packet: DataPacket) -> Scan | None:
-        """Add a packet to its revolution, or to two where the rotor passes the cut within it."""
+        """Add a packet to its revolution, or to two if the rotor passes the cut within it."""
         past_cut = (packet.azimuth - self._cut) % velodyne.AZIMUTH_STEPS
         scan = None
         if self._pieces:

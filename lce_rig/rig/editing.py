@@ -145,7 +145,7 @@ def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
 
 
 def _end(node: yaml.Node) -> int:
-    """Find where a node's text ends; a block's own mark is after the comments that follow it."""
+    """Find the end of a node's text; a block's own mark is after the comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -224,7 +224,7 @@ class IntrinsicsSettings(Settings):
     Attributes:
         model: radtan (OpenCV's and ROS's plumb_bob) or equidistant (OpenCV's fisheye).
         distortion: radtan k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant k1 k2 k3 k4.
-        focal_sigma_px: standard deviation of both focal lengths alike; by default 0.25 % of `fx_px`.
+        focal_sigma_px: common standard deviation of both focal lengths; by default 0.25 % of `fx_px`.
         principal_point_sigma_px: standard deviation of `cx_px` and of `cy_px`; by default 0.4 % of `fx_px`.
         distortion_sigma_px: standard deviation of a pixel's displacement in the image's corner by errors of
             the distortion; by default 0.25 % of `fx_px`.

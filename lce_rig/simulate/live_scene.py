@@ -28,7 +28,7 @@ class LiveScene:
 
     Attributes:
         stage: the simulated rig and its room.
-        T_world_board: (4, 4) where the board is.
+        T_world_board: (4, 4) present pose of the board.
     """
 
     def __init__(self, rig: Rig, seed: int, options: SimulationOptions) -> None:

@@ -153,8 +153,8 @@ class SimulationOptions:
         carrier: support of the board: a stand, a person or none.
         lidar: errors of all LiDARs; None for those of each one's data sheet.
         camera: the cameras' errors.
-        distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
-            fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
+        distance_m: range of the board's distance from the camera; no board is placed where the LiDAR would
+            see less than four fifths of the plate (a diamond of 1 m nearer than about 1.4 m).
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
         truth_rotation_deg, truth_translation_m: maximum distance of the true extrinsics from the profile's

@@ -146,7 +146,7 @@ class SimulatedCapture:
             frames, at the timestamp of the scan it was placed for.
         target: the camera and the LiDAR that the board was placed for; others may not see it.
         events: one a camera that has a channel of events, if the board moves.
-        trajectory: where the board is in the world at any time of the rig's clock, the LiDAR's.
+        trajectory: pose of the board in the world at any time of the rig's clock, the LiDAR's.
         T_world_sensor: (4, 4) of each camera and LiDAR.
     """
 
@@ -361,7 +361,7 @@ def simulate_recording(
 
 
 def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
-    """Return where the board is before the first LiDAR, 100 times per second.
+    """Return the board's pose before the first LiDAR, 100 times per second.
 
     Returns:
         `boards`: by LiDAR `t_ns` (K), on the rig's clock, and `T_sensor_board` (K, 4, 4).

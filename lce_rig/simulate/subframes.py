@@ -149,7 +149,7 @@ def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: i
 
 
 def _window(points: Array, backdrop: Backdrop) -> Window | None:
-    """Bound the pixels of points (N, 3), world, with a margin; None where the image shows none."""
+    """Bound the pixels of points (N, 3), world, with a margin; None if they are outside the image."""
     pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), points))
     if not is_valid.any():
         return None

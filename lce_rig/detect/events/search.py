@@ -48,7 +48,7 @@ def nearest_pose(
     return T, pose_covariance(T, board.corners()[is_seen], intrinsics, found.sigma_px)
 
 
-#: When the board is looked for besides the main picture, ns after it.
+#: Times after the main image of the additional images in which the board is searched, ns.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
 # Maximum rotation by hand between neighbouring images; beyond, it is another board, or misread.
 _MAX_TURN_RAD = np.radians(45)

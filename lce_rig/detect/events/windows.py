@@ -34,7 +34,7 @@ class WindowRule(NamedTuple):
         return max(min(n_events / self.n_events, age_ns / _SHORTEST_NS), age_ns / _LONGEST_NS)
 
     def end(self, events: Events, start_ns: int) -> int | None:
-        """Find where the window ends that began at start_ns with the first of `events`, ns; None if not yet.
+        """Find the end of the window that began at start_ns with the first of `events`, ns; None if open.
 
         The window is [start, end): the event that completes the count still belongs to it.
         """

@@ -220,7 +220,7 @@ def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
     H[:, 0, 0], H[:, 1, 1], H[:, 0, 1] = duu[v, u], dvv[v, u], duv[v, u]
     H[:, 1, 0] = H[:, 0, 1]
     values, vectors = np.linalg.eigh(H)
-    # From the pixel to where the slope vanishes; Sobel's second derivatives are four times as large.
+    # Offset from the pixel to the zero of the slope; Sobel's second derivatives are four times as large.
     slope = np.stack([smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1) / 2
     shift = np.clip(-4.0 * np.linalg.solve(H, slope[..., None])[..., 0], -1.0, 1.0)
     # Along the edges the second derivative vanishes: between the eigenvectors, in the ratio of their values.

@@ -100,7 +100,7 @@ def keep_marked(
     Args:
         grey: (H, W).
         board: one that has markers.
-        crossings: fitted about where the corners were.
+        crossings: fitted about the corners' former places.
         was_seen: (rows, cols) which corners the board showed.
 
     Returns:
@@ -283,7 +283,7 @@ def _fits(on_board: Array, flat: Array, is_ahead: NDArray[np.bool_]) -> NDArray[
 def _measure(
     grey: Grey, board: Board, intrinsics: Intrinsics, T_cam_board: Array, is_legacy: bool
 ) -> tuple[Crossings | None, int]:
-    """Measure the corners about where a pose has them; None if too few are seen, and their number."""
+    """Measure the corners near a pose's prediction; None if too few are visible, and their number."""
     shape, corners = (board.rows, board.cols), board.corners()
     signs = _signs(board) * (-1 if is_legacy else 1)
     grid_px = intrinsics.project(transform(T_cam_board, corners))[0].reshape(*shape, 2)

@@ -32,7 +32,7 @@ LEAST_MARKED_PX = 20.0
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
 # Limits of images without a board: least grey spread, and greatest width of the strongest edges.
 _MIN_SPREAD, _MAX_EDGE_PX = 50.0, 6.0
-# The outer squares of a line that is not on the board are all alike.
+# Minimum ratio of the outer squares' contrast to the inner ones'; off the board, a line's are all the same.
 _MIN_OUTER_CONTRAST = 0.35
 
 
@@ -70,7 +70,7 @@ def _shortest_side_px(grid_px: Array) -> float:
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
-    """Check that the pattern ends where the grid of corners says.
+    """Check that the pattern ends at the border of the grid of corners.
 
     The squares outside the outermost corners must alternate as those inside do, the next ones must not.
 
@@ -173,7 +173,7 @@ def explain_other_grid(
     if is_whole(grey, seen_px):
         figures |= {"n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     if is_part:
-        # A pattern that goes on beyond the corners found is neither covered nor another one.
+        # A pattern that continues beyond the corners found is neither covered nor another one.
         kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
         return kind.refusal(action=action, **figures)
     return IMAGE_OTHER_BOARD.refusal(**figures)

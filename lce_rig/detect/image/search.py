@@ -197,7 +197,7 @@ def _follow(
 def _find_near(
     grey: NDArray[np.uint8], board: Board, last: ImageBoard | None, *, is_thorough: bool
 ) -> Crossings | None:
-    """Search about where the board was."""
+    """Search near the board's last place."""
     if last is None:
         return None
     # The corners' box, larger by half its size.

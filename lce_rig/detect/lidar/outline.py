@@ -72,7 +72,7 @@ class Outline(NamedTuple):
 def thin(n: int, most: int) -> Indices:
     """Choose about `most` of n returns at random, the same ones each time, or all of fewer.
 
-    At even steps, they would be those of some of a LiDAR's lines, which recur in order and err alike.
+    Even steps would pick a few of a LiDAR's lines, which recur in order and have the same errors.
     """
     if n <= most:
         return np.arange(n)
@@ -215,7 +215,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
     """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (4, M) by each distance s_e.
 
-    Sides are right, left, top and bottom; `blur` is of each, or of the first and the last two alike.
+    Sides are right, left, top and bottom; `blur` has one value per side, or one per pair of sides.
     """
     from scipy.special import ndtr
 
@@ -233,7 +233,7 @@ class Strips(NamedTuple):
     """Short pieces of the border, each measured on its own: K of them.
 
     Attributes:
-        uv: (K, 2) their middles where the plate's returns end, m.
+        uv: (K, 2) their middles at the end of the plate's returns, m.
         outwards: (K, 2) unit normals.
         off_m: (K,) distance outwards from the fitted outline.
         sigma_m: (K,) standard deviations.

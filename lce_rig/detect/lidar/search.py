@@ -43,7 +43,7 @@ class Limits:
     """Limits of the search, and for accepting a plate as the board.
 
     Attributes:
-        template_m: largest mean distance of the outline from where the rings end.
+        template_m: largest mean distance of the outline from the ends of the rings.
         rms_m: largest rms distance of the returns from the plane.
         min_rings: fewest rings on the board.
         min_range_m: nearer returns are ignored.
@@ -82,7 +82,7 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
 
     Args:
         view: beams about the plate.
-        placement: where the outline fits best.
+        placement: the best fit of the outline.
         limit_m: largest error of an outline.
         rms_limit_m: largest rms distance of the returns from the plane.
     """
@@ -350,7 +350,7 @@ def look_for_board(
 def board_at(
     found: list[LidarBoard] | Refusal, T_lidar_board: Array, cause: Refusal | None = None
 ) -> LidarBoard | Refusal:
-    """Choose the board that lies where a pose (4, 4) has it; or refuse, by a cause or that of the search."""
+    """Choose the board at a pose (4, 4), or refuse, with the given cause or the search's."""
     if isinstance(found, Refusal):
         cause = cause or found
         return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
@@ -375,6 +375,6 @@ def _measure_at(
 
 
 def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
-    """Return whether a board lies where a pose has it."""
+    """Return whether a board is at a pose."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
     return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > LOOK_TURN

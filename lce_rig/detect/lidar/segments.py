@@ -165,7 +165,7 @@ def _azimuth_step(turn: Floats) -> float:
 def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:
     """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
 
-    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the rest.
+    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is used, as edges and foliage spoil the rest.
     """
     second = np.abs(range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])
     is_plain = (ring[:-2] == ring[2:]) & (turn[1:-1] < 0.01) & (turn[2:] < 0.01)

@@ -31,7 +31,7 @@ class PlaneView:
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
         dark_m: longest way across a dark square whose beams return nothing, or weakly from too far; 0 where
-            all squares return alike.
+            all squares return the same.
         may_be_hidden: whether the border may lie farther out than where a ring ends behind another surface.
     """
 
@@ -126,7 +126,7 @@ def view_plane(
         among: (K,) of them that are tried.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
-        radius_m: of the disc that is looked at.
+        radius_m: of the disc examined.
         tolerance_m, dark_m: as in the view.
     """
     normal, d = plane[:3], plane[3]
@@ -163,7 +163,7 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
     Args:
         scan: all returns.
         view: beams about the plate.
-        placement: where the board is thought to be.
+        placement: estimated place of the board.
 
     Returns:
         First and last beam of each run (C,), as indices into the view.
@@ -281,7 +281,7 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
     """Find for each of G plates the placement of the board's outline whose border is nearest to its ends.
 
     Args:
-        ends: (G, M, 2) where the rings begin and end in each plate's plane, m; NaN fills the rows up.
+        ends: (G, M, 2) start and end of the rings in each plate's plane, m; NaN fills the rows up.
         board: gives the rectangle.
     """
     half = (board.width_m / 2, board.height_m / 2)

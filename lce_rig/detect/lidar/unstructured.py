@@ -209,7 +209,7 @@ class _View(PlaneView):
     """The view of a plate in a point cloud without rings.
 
     Attributes:
-        returns: (M, 4) x, y, z, intensity; intensities are all the same where the point cloud has none.
+        returns: (M, 4) x, y, z, intensity; intensities are all the same if the point cloud has none.
         beam: the LiDAR's.
     """
 

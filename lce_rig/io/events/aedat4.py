@@ -79,7 +79,7 @@ class Aedat4File:
             header = file.read(_MOST_HEADER_BYTES)
             if header.startswith(_MAGIC):
                 (n_bytes,) = struct.unpack_from("<I", header, len(_MAGIC))
-                # aedat ends the program where the header's text is none.
+                # aedat ends the program if the header is not text.
                 header[header.index(b"<dv") : len(_MAGIC) + 4 + n_bytes].decode()
             with _panics():
                 self.streams |= sorted(aedat.Decoder(path).id_to_stream().items())

@@ -93,7 +93,7 @@ class EventRecording:
         path: the file or folder.
         sensor: name of the camera.
         resolution_px: (width, height).
-        serial: the camera's serial number; "" where the file does not name it.
+        serial: the camera's serial number, or "".
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class EventRecording:
         return self.start_ns, max(int(stretch.t_ns[-1]) for stretch in self)
 
     def tie_to_host(self) -> None:
-        """Move timestamps that count from the sensor's start to the host's clock, where arrivals are known.
+        """Move timestamps that count from the sensor's start to the host's clock, if arrivals are known.
 
         The shift is the least difference among the first packets: the one that waited least.
         """

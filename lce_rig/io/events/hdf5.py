@@ -1,6 +1,6 @@
 """Events in HDF5: columns {t,x,y,p} of DSEC's group events or of the root, or Metavision's table CD/events.
 
-Times are microseconds, after t_offset where the file has one.
+Times are microseconds, after t_offset if the file has one.
 
 References:
     https://dsec.ifi.uzh.ch/data-format/
@@ -106,7 +106,7 @@ def _find(group: Any, name: str, most_links: int = _MOST_LINKS) -> Any:
     """Return the object of a name, None if there is none; links inside the file are followed.
 
     Args:
-        group: where a relative name begins.
+        group: origin of a relative name.
         name: with slashes.
         most_links: soft links that may follow each other.
 

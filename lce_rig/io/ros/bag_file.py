@@ -93,7 +93,7 @@ class BagFile:
                 for connection, log_ns, data in merge(*passes, key=lambda entry: int(entry[1])):
                     encoding = getattr(connection.ext, "serialization_format", "ros1")
                     data = bytes(data)
-                    # Without its metadata.yaml a bag does not say that each message is compressed; CDR begins
+                    # A bag without metadata.yaml does not state that each message is compressed; CDR begins
                     # with a zero.
                     if encoding != "ros1" and data.startswith(_ZSTD_MAGIC):
                         data = unpack(_zstd().ZstdDecompressor, data)

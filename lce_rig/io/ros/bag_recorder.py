@@ -33,7 +33,7 @@ _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def open_bag_writer(path: Path) -> Any:
-    """Begin a bag: ROS 1 where the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    """Begin a bag: ROS 1 if the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
     if path.suffix == ".bag":
         from rosbags.rosbag1 import Writer as Ros1Writer
 
@@ -67,7 +67,7 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
 
 
 def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryview:
-    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
+    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, if known, time.
 
     Args:
         scan: the scan; one without a timestamp gets 0, which readers take for none.
@@ -229,7 +229,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
-        """End the bag where a full disk or an interrupt tears it: nothing is written behind that."""
+        """Close the bag after a full disk or an interrupt; nothing is written after that."""
         if self._failure is not None:
             raise self._failure
         try:

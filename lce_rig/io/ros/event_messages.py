@@ -87,7 +87,7 @@ class PacketDecoder:
         """Decode a packet.
 
         Raises:
-            ValueError: it is of no known encoding.
+            ValueError: its encoding is not supported.
         """
         events, base_ns = NO_EVENTS, 0
         if packet.encoding == "evt3":

@@ -110,7 +110,7 @@ class TopicDecoder:
         return lines if self._packets is None else lines + worded(self._packets.losses)
 
     def _assemble(self, content: Any) -> list[Image | Scan]:
-        """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
+        """Assemble the packets of a message; a scan ends at the rotor's cut, not with the message."""
         assert isinstance(self._settings, LidarSettings)  # as packets have no camera
         if self._packets is None:
             self._packets = Vlp16Stream(self._target.sensor, self._settings)

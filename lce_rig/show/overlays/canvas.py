@@ -104,7 +104,7 @@ def draw_diamonds(
 def draw_line(
     picture: Picture, pixels: Array, colour: Colour, width_px: int = 2, casing: Colour | None = BLACK
 ) -> None:
-    """Draw a polyline through (N, 2) px, interrupted where a pixel is NaN, cased to be visible anywhere."""
+    """Draw a polyline through (N, 2) px, interrupted at NaN pixels, cased to be visible anywhere."""
     ends = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
     for part in np.split(pixels, ends):
         part = part[np.isfinite(part).all(axis=1)]

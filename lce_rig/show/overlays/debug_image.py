@@ -136,7 +136,7 @@ def _draw_events(
     board: Board,
     intrinsics: Intrinsics,
 ) -> None:
-    """Draw recent events over the image, and in grey from where and to where the board was tracked."""
+    """Draw recent events over the image, and in grey the start and end of the board's track."""
     shown = recent_events(image, events)
     show_image(axes, (_DIM * image.pixels).astype(np.uint8))
     for is_kind, colour in ((shown.polarity, BRIGHTER), (~shown.polarity, DARKER)):

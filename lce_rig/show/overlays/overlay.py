@@ -293,7 +293,7 @@ def _draw(
 
 
 def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
-    """Describe a camera at the first LiDAR's place that looks at the boards.
+    """Return a check with a camera in the first LiDAR's place, which looks at the boards.
 
     Args:
         check: of two LiDARs.

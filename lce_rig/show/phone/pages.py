@@ -193,7 +193,7 @@ class Feed:
 class Viewer:
     """Feeds one open page with the newest state as fast as it can follow, and no faster.
 
-    The page answers each message once it is on the screen, and says whether it is looked at: only then are
+    The page answers each message once it is on the screen, and reports whether it is visible; only then are
     images sent. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
     from it.
     """
@@ -245,7 +245,7 @@ class Viewer:
             await self._line.send_bytes(jpeg)
 
     async def _read_answer(self) -> bool:
-        """Read up to {"visible": bool}, and requests {"take_back": name}; False where it is neither."""
+        """Read up to {"visible": bool}, and requests {"take_back": name}; False for anything else."""
         while True:
             received = await self._line.receive(ANSWER_S)
             try:

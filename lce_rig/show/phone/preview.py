@@ -59,8 +59,8 @@ def listen(host: str, port: int) -> socket.socket:
 def links(opened: socket.socket, token: str) -> tuple[str, ...]:
     """Build the links under which a page can be opened, the likeliest first.
 
-    Where the socket listens on all addresses, there is one for each IPv4 address of this computer: which of
-    its networks a phone is in cannot be known.
+    If the socket listens on all addresses, there is one for each IPv4 address of this computer, as the phone
+    may be in any of its networks.
     """
     host, port = opened.getsockname()
     hosts = [host]
