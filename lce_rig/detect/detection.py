@@ -61,7 +61,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection | Image:
-    """Rebuild what `to_arrays` flattened.
+    """Rebuild the detection or image from the arrays of `to_arrays`.
 
     Raises:
         ValueError: the arrays are not a detection.
@@ -193,12 +193,12 @@ class Detections:
 
 
 def _as_scan(found: ImageDetection, corners: Array) -> LidarDetection:
-    """Give the poses that an image leaves open as a scan's candidates."""
+    """Convert the two poses that fit an image to candidates of a scan."""
     return found if isinstance(found, Refusal) else PatternBoard.candidates(found, corners)
 
 
 def _as_image(found: LidarDetection) -> ImageDetection:
-    """Give the poses of the two likeliest boards in a scan as those that an image leaves open."""
+    """Convert the poses of the two likeliest boards in a scan to the two poses that fit an image."""
     if isinstance(found, Refusal):
         return found
     T, other = found[0].T_lidar_board, found[1].T_lidar_board if len(found) > 1 else None

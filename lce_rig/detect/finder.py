@@ -42,8 +42,8 @@ class Search(Generic[Boards]):
 
     Attributes:
         located: the board in an image, or the surfaces of its size in a scan, likeliest first, which can be
-            followed into the next one; or why there are none.
-        usable: what of them the profile's limits admit; else why they do not.
+            followed into the next one; or the refusal.
+        usable: those within the profile's limits, or the refusal.
     """
 
     located: Boards | Refusal
@@ -177,7 +177,7 @@ class BoardFinder:
 def check_origin(scan: Scan) -> Refusal | None:
     """Refuse a scan whose rings meet far from the frame's origin, as one moved to the robot's frame.
 
-    Beams are taken to begin at the origin. From elsewhere, ring ends and ranges are wrong at every distance.
+    Beams are assumed to begin at the origin; otherwise ring ends and ranges are wrong at every distance.
     """
     if not np.any(scan.ring != NO_RING):
         return None

@@ -54,7 +54,7 @@ class ExportJob:
         rig: the profile the calibrations belong to.
         folder: for the files.
         robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
-        session: with the images and scans; None where only results are at hand.
+        session: with the images and scans; None if only results are available.
         findings: content that was left out of the outputs or put into another form, and why; grows.
     """
 
@@ -85,17 +85,17 @@ class ExportJob:
         return build_trees(self.calibrations, self.rig, self.robot)
 
     def name_of(self, calibration: Calibration) -> str:
-        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too where there are several."""
+        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too in a rig of several."""
         both = f"{calibration.camera}_{calibration.lidar}"
         return both if len(self.rig.lidars) > 1 else calibration.camera
 
     def image_topic(self, calibration: Calibration) -> str:
-        """Name the topic of a calibration's images."""
+        """Return the topic of a calibration's images."""
         camera = self.rig.cameras[calibration.camera]
         return camera.channels[calibration.channels[0]].topic or f"/{calibration.camera}"
 
     def points_topic(self, calibration: Calibration) -> str:
-        """Name the topic of a calibration's point clouds."""
+        """Return the topic of a calibration's point clouds."""
         return self.rig.lidars[calibration.lidar].topic or f"/{calibration.lidar}/points"
 
     def head(self, content: str, *calibrations: Calibration, of_one_camera: bool = False) -> list[str]:
@@ -197,7 +197,7 @@ def export(
         rig: the profile the calibrations belong to.
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
-        is_forced: write failed calibrations too; every file then says so.
+        is_forced: write failed calibrations too; every file is then marked as failed.
         session: with images and scans, for formats that show them.
         robot: its own tree of frames, into which the outputs are to fit.
         findings: gets those about content that is left out or in another form.

@@ -63,7 +63,7 @@ def export_ply(job: ExportJob) -> list[Path]:
 def coloured(
     image: Image, scan: Scan, calibration: Calibration, job: ExportJob, number: int
 ) -> NDArray[np.void]:
-    """Give the points that the camera sees the colours of their pixels, as records of the file."""
+    """Colour the points in the camera's view by their pixels; return them as records of the file."""
     lens = job.rig.cameras[calibration.camera].to_intrinsics()
     colours, is_seen = colour_points(scan, image.pixels, calibration.T_cam_lidar, lens)
     points = np.empty(int(is_seen.sum()), _POINT)

@@ -84,7 +84,7 @@ def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
 def _worked_point(
     c: Calibration, T_lidar_cam: Array, lens: Intrinsics
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Give a point in front of the camera, round in the LiDAR's frame, to check the pose and its inverse."""
+    """Return a point in front of the camera, rounded in the LiDAR's frame, to check pose and inverse."""
     point_lidar = np.round(transform(T_lidar_cam, np.array([[0.3, 0.2, 3.0]])), 2)
     point_camera = transform(c.T_cam_lidar, point_lidar)
     pixel, _ = lens.project(point_camera)

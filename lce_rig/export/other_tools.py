@@ -1,6 +1,6 @@
 """Formats of other tools: Kalibr, direct_visual_lidar_calibration, FAST-LIVO2, OpenCV and Autoware.
 
-A camera model with more coefficients than a format has is replaced by the one that draws most alike.
+A camera model with more coefficients than a format has is replaced by the best-fitting one that it has.
 
 Autoware's kit frame is `sensor_kit_base_link`. A LiDAR's entry there is the base of its housing, from which
 its description leads to the frame of the points; a camera's is its body, `NAME/camera_link`.
@@ -42,14 +42,14 @@ _LIVO2_MODELS = {"radtan": "Pinhole", "equidistant": "EquidistantCamera"}
 
 
 def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
-    """Find the model with fewer coefficients that draws the whole image as another does.
+    """Fit a model with fewer coefficients to given intrinsics over the whole image.
 
     Args:
-        given: the other; one that needs no more coefficients is returned as it is, filled with zeros.
-        name: "radtan4" or "radtan5"; a fisheye stays one.
+        given: the intrinsics; with no more coefficients than the model, they are only padded with zeros.
+        name: "radtan4" or "radtan5"; a fisheye stays a fisheye.
 
     Returns:
-        The model, and its distance from the other over the image, px, rms and at most; 0 if it is the same.
+        The fit, and its distance from the given ones over the image, px, rms and maximum; 0 if identical.
     """
     model = MODELS[name if given.model == "radtan" else "equidistant"]
     n = len(model.coefficients)
@@ -65,7 +65,7 @@ def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
 
 
 def lens_for(job: ExportJob, format_name: str, camera: str, model: str) -> tuple[Intrinsics, list[str]]:
-    """Give a camera's model with the coefficients of a format; file and finding say if it is a fit.
+    """Return a camera's model with the coefficients of a format; file and finding note a fit.
 
     Args:
         job: which gets the finding.
@@ -259,9 +259,9 @@ class _Entry(NamedTuple):
 
 
 def export_autoware(job: ExportJob) -> list[Path]:
-    """Write Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml where base_link is known.
+    """Write Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml if base_link is known.
 
-    Without a frame `sensor_kit_base_link` in the robot's tree, the kit is where the first sensor's entry is.
+    Without a frame `sensor_kit_base_link` in the robot's tree, the kit is at the first sensor's entry.
     """
     paths = []
     for index, tree in enumerate(job.trees):
@@ -321,7 +321,7 @@ def _below_kit(tree: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
     if bodies.intersection(between):
         return None
     key = [frame, *between][-1]
-    # What lies between is the sensor's description, which stays as the robot has it.
+    # The frames in between are the sensor's own description, which the robot keeps unchanged.
     return _Entry(key, frame, job.robot.find_pose(key, frame))
 
 

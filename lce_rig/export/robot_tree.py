@@ -43,7 +43,7 @@ class JointChange(NamedTuple):
     """A joint that is new, or that has another pose.
 
     Attributes:
-        joint: as it is to be.
+        joint: the joint after the change.
         before: T_parent_child (4, 4) of the robot's own; None for a new joint.
     """
 
@@ -96,7 +96,7 @@ class RobotTree:
         Args:
             source: for messages.
             joints: in any order.
-            links: the frames, where the source lists them.
+            links: the frames, if the source lists them.
             has_one_root: whether it has to be one tree; else several, as static transforms make where others
                 change while the robot drives.
 
@@ -192,15 +192,15 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
 def fit_tree(
     robot: RobotTree | None, calibrations: Sequence[Calibration], rig: Rig
 ) -> tuple[RobotTree, list[JointChange], list[tuple[str, ...]]]:
-    """Change the joints of a robot's tree so that calibrated sensors lie as the calibrations say.
+    """Change the joints of a robot's tree to the poses of calibrated sensors.
 
-    Of the sensors that calibrations connect, the one nearest to the root stays. Each other one that the
-    robot has keeps its parent, and only its joint's pose changes; one that it lacks is added below the sensor
-    it was calibrated with. An optical frame that the robot has stays as it is below its body. The profile's
-    `mount` adds its sensor to a robot that lacks it.
+    Of the sensors that calibrations connect, the one nearest to the root stays. Each other sensor of the
+    robot keeps its parent, and only its joint's pose changes; a sensor that the robot lacks is added below
+    the sensor it was calibrated with. An optical frame of the robot stays unchanged below its body. The
+    profile's `mount` adds its sensor to a robot that lacks it.
 
     Args:
-        robot: its own tree; None for one of the sensors alone, under `mount` where the profile has one.
+        robot: its own tree; None for one of the sensors alone, under the profile's `mount` if it has one.
         calibrations: of the rig's sensors.
         rig: the profile, which names the frames.
 
@@ -304,7 +304,7 @@ def _connected(calibrations: Sequence[Calibration], bodies: Mapping[str, str]) -
 def _placed(
     tree: RobotTree, calibration: Calibration, rig: Rig, anchor: str
 ) -> tuple[RobotTree, list[JointChange]]:
-    """Put the other sensor of a calibration where it belongs, beside the one that is placed."""
+    """Place the other sensor of a calibration, relative to the one already placed."""
     first, second = rig.frame_of(calibration.camera), rig.frame_of(calibration.lidar)
     T_first_second, opticals = calibration.T_cam_lidar, []
     if calibration.camera in rig.cameras:
@@ -345,7 +345,7 @@ def _optical(tree: RobotTree, camera: CameraSettings) -> Joint:
 
 
 def _place(tree: RobotTree, anchor: str, child: str, T_anchor_child: Array) -> Joint:
-    """Build the joint that puts a frame where it belongs, below the parent that it has."""
+    """Build the joint that places a frame relative to the anchor, below its present parent."""
     if child not in tree.frames:
         return Joint(anchor, child, T_anchor_child)
     joint = tree.above.get(child)

@@ -113,7 +113,7 @@ def export_mcap(job: ExportJob) -> list[Path]:
 
 
 def image_topic(job: ExportJob, camera: str, channel: str) -> str:
-    """Name the topic of a camera's images, with a namespace of its own for its camera_info."""
+    """Return the topic of a camera's images, in a separate namespace for its camera_info."""
     topic = job.rig.cameras[camera].channels[channel].topic or f"/{camera}/{channel}"
     topic = topic if topic.startswith("/") else f"/{topic}"
     return topic if topic.count("/") > 1 else f"{topic}/image"

@@ -26,7 +26,7 @@ from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-# Rounding of the float64 that ROS writes is far below; a quaternion that differs more is no rotation.
+# Tolerance of a quaternion's norm, far above the rounding of ROS's float64; more is not a rotation.
 _UNIT_TOLERANCE = 1e-3
 _ORIGIN = re.compile(rb"""<origin\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
@@ -86,7 +86,7 @@ def read_robot(path: Path) -> RobotTree:
 def read_robot_bag(path: Path) -> RobotTree:
     """Read the transforms on /tf_static of a ROS 1 bag, a ROS 2 bag or an mcap file.
 
-    Of several transforms to one frame the last counts, as in tf.
+    The last of several transforms to one frame counts, as in tf.
 
     Raises:
         SourceError: the bag cannot be read, is damaged, or has no static transforms.
@@ -121,7 +121,7 @@ def read_robot_urdf(path: Path) -> RobotTree:
     """Read a robot's tree of frames from its URDF.
 
     Raises:
-        SessionError: the file cannot be read or is no URDF; xacro has to be expanded first.
+        SessionError: the file cannot be read or is not a URDF; xacro has to be expanded first.
     """
     return _parse(path, _read(path))
 
@@ -168,8 +168,7 @@ def write_into_urdf(
         now: names the backup, path.urdf.2026-11-22T101500.bak.
 
     Returns:
-        The file with the earlier text, None where nothing had to change, and the joints that are new or
-        moved.
+        The file with the earlier text, None if nothing had to change, and the joints that are new or moved.
 
     Raises:
         SessionError: it is not a URDF, does not fit (`fit_tree`), or cannot be written; it is unchanged.
@@ -199,7 +198,7 @@ def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> byt
         joint = change.joint
         if joint.child in tree.above:
             start, end = places[tree.above[joint.child].name]
-            # Comments are no origins.
+            # An <origin> inside a comment does not count.
             blanked = re.sub(
                 rb"<!--.*?-->", lambda comment: b" " * len(comment.group()), text[start:end], flags=re.S
             )
@@ -217,7 +216,7 @@ def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> byt
     if added:
         end = text.rindex(b"</robot")
         lines = [f"  <!-- added by {MADE_BY} -->", *added]
-        # References to characters hold in whatever encoding the file declares.
+        # Character references are valid in any encoding that the file declares.
         edits.append((end, end, ("\n".join(lines) + "\n").encode("ascii", "xmlcharrefreplace")))
     for start, end, new in sorted(edits, reverse=True):
         text = text[:start] + new + text[end:]

@@ -74,7 +74,7 @@ class SensorChange:
         camera, lidar: the sensors.
         is_new: whether the new set has extrinsics of them.
         rotation_deg, translation_m: between both sets; None if only one of them has extrinsics.
-        verdict, verdict_there: of the new and the deployed result; "" where there is none.
+        verdict, verdict_there: of the new and the deployed result, or "".
     """
 
     camera: str
@@ -95,7 +95,7 @@ class Plan:
         state: of the target now.
         changed: files that differ from the current release's: "changed", "missing", "added".
         sensors: changes of the extrinsics.
-        findings: objections, and notes of what could not be compared.
+        findings: objections, and notes on sets that could not be compared.
         diff: lines in which texts differ, as `diff -u` prints them.
     """
 
@@ -153,7 +153,7 @@ def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | N
         session: with images and scans, for formats that show them.
 
     Raises:
-        SessionError: there is no result.
+        SessionError: the result is missing.
         TargetError: the target cannot be reached or read.
     """
     with TemporaryDirectory(prefix="lce-rig-") as folder:
@@ -185,7 +185,7 @@ def deploy(
         announce: receives the changes before anything is refused or changed.
 
     Raises:
-        SessionError: there is no result.
+        SessionError: the result is missing.
         ResultRefusedError: there are objections and no reason.
         TargetError: the target cannot be reached or written, or another deployment came first.
         CommandError: the command failed; the new files are in place.
@@ -329,7 +329,7 @@ def _stage(
 
 
 def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
-    """List objections to a deployment, and note where no date tells which captures are older."""
+    """List objections to a deployment, and note missing dates: the older captures are then unknown."""
     origin = saved.provenance
     findings = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
@@ -353,7 +353,7 @@ def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord |
 
 
 def _pairs(folder: Path) -> tuple[str, dict[tuple[str, str], Calibration]]:
-    """Read the rig's name and the calibrations of a set; none where it has no result."""
+    """Read the rig's name and the calibrations of a set; empty if it holds no readable result."""
     with suppress(LceRigError):
         saved = read_result(folder / RESULT)
         return saved.rig, {(pair.camera, pair.lidar): pair for pair in saved.pairs}
@@ -428,10 +428,10 @@ def _commit(
 
 
 def _run(place: Place, target: TargetSettings, release: str) -> str | None:
-    """Run the target's command; give its output, None if there is no command.
+    """Run the target's command; return its output, or None without a command.
 
     Raises:
-        CommandError: it failed, or whether it did is not known; the files are in place.
+        CommandError: it failed, or its outcome is unknown; the files are in place.
     """
     if target.run is None:
         return None

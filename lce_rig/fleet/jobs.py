@@ -1,4 +1,4 @@
-"""Find sessions and recordings below a root, with what a manifest says of them."""
+"""Find sessions and recordings below a root, with their entries in a manifest."""
 
 import hashlib
 import re
@@ -35,7 +35,7 @@ class Job:
 
 
 class Entry(BaseModel):
-    """One entry of a manifest: what is known of the sessions and recordings that match a pattern."""
+    """One entry of a manifest: robot and rig of the sessions and recordings that match a pattern."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
 
@@ -76,10 +76,10 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """List the sessions and recordings below a folder.
 
     A manifest, `fleet.yaml` in the folder unless another is given, names them by patterns.
-    Without one, every session is taken.
+    Without one, every session is used.
 
     Args:
-        root: where they lie.
+        root: folder of the sessions and recordings.
         manifest: the manifest.
 
     Raises:
@@ -123,7 +123,7 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
-    """Find what the entries name; the first entry that matches a path counts.
+    """Find the paths that the entries name; the first entry that matches a path counts.
 
     Raises:
         ProfileError: an entry's profile does not exist; its path starts at the manifest's folder.
@@ -145,7 +145,7 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
 
 
 def folder_name(text: str) -> str:
-    """Make a name of a folder from any text; different texts give different names."""
+    """Build a folder's name from any text; different texts give different names."""
     name = _SAFE.sub("_", text).strip(".")[:80]
     if name == text:
         return name

@@ -284,7 +284,7 @@ class Place:
         self._options = [word for name, value in options.items() for word in ("-o", f"{name}={value}")]
 
     def command(self, script: str, *arguments: str) -> list[str]:
-        """Give the words that run a POSIX script there, with the folder's path as its first argument."""
+        """Return the command that runs a POSIX script there, with the folder's path as its first argument."""
         words = ["sh", "-c", script, "sh", self.path, *arguments]
         if self._host is None:
             return words
@@ -336,7 +336,7 @@ class Place:
         """Copy a folder of this name there, of plain files, to a new one here.
 
         Returns:
-            The first of its entries that are no plain files, or too large; then nothing is copied.
+            The first of its entries that are not plain files, or too large; then nothing is copied.
 
         Raises:
             TargetError: it cannot be reached or read.
@@ -385,6 +385,6 @@ class Place:
 
 
 def _last_line(text: str) -> str:
-    """Give the last line that says anything; ssh prints warnings before the cause."""
+    """Return the last line that is not empty; ssh prints warnings before the cause."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1] if lines else "no message"

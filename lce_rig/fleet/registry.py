@@ -1,8 +1,8 @@
 """The registry: a folder of each session's result, and the table of them all.
 
 The table has a row for each camera and LiDAR of a session, or for a session that failed. It is an index: a
-folder of the registry holds result.json, and beside it `ROWS` with what result.json does not hold: `SESSION`.
-`PAIR` selects the other columns from result.json, here and nowhere else.
+folder of the registry holds result.json, and beside it `ROWS` with the columns that result.json lacks:
+`SESSION`. `PAIR` selects the other columns from result.json, here and nowhere else.
 """
 
 import io
@@ -83,7 +83,7 @@ _COMPRESSION = "lz4"
 
 
 def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mapping[str, str]) -> list[Row]:
-    """Put the columns `PAIR` of each result into its row; figures that are not finite are null.
+    """Add the columns `PAIR` of each result to its row; figures that are not finite are null.
 
     Args:
         rows: of one session, as in `ROWS`: one with status "ok" for all results, and one for each camera and
@@ -126,7 +126,7 @@ def _flat(column: Any) -> Array:
 
 
 def as_table(rows: Iterable[Row]) -> Any:
-    """Put rows into a `pyarrow.Table` of `SCHEMA`; other names are ignored."""
+    """Build a `pyarrow.Table` of `SCHEMA` from rows; other names are ignored."""
     return pa.Table.from_pylist(list(rows), schema=SCHEMA)
 
 
@@ -157,7 +157,7 @@ def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None
         columns: the names of those to read; None for all.
 
     Raises:
-        SessionError: there is no such file, or it is not such a table.
+            SessionError: the file is missing, or not such a table.
     """
     place = place if isinstance(place, Storage) else Storage.at(place)
     names = list(SCHEMA.names if columns is None else columns)
@@ -257,7 +257,7 @@ class Registry:
                 return
 
     def set_aside(self, folder: str) -> None:
-        """Move a result below `SUPERSEDED`, where the table does not find it; numbered, if one is there.
+        """Move a result below `SUPERSEDED`, out of the table's sight; numbered, if one is there.
 
         Raises:
             SessionError: it cannot be written; the result stays.
@@ -279,7 +279,7 @@ class Registry:
         return f"{robot}/{names[-1]}" if names else None
 
     def rows(self, folder: str) -> list[Row]:
-        """Read the rows of one result: none if it is no result, one with a cause if its files are damaged."""
+        """Read the rows of one result: none without a result, one with a cause if its files are damaged."""
         place = self.place / folder
         robot, _, name = folder.partition("/")
         names = {"robot": robot, "folder": folder}
@@ -315,7 +315,7 @@ class Registry:
                 "list_contains(findings, 'verdict.moved')"; "" for all rows.
 
         Raises:
-            SessionError: there is no table, or it cannot be read.
+            SessionError: the table is missing, or cannot be read.
             UsageError: the condition or a column is wrong; the columns are named.
         """
         names = list(columns or SCHEMA.names)
@@ -361,7 +361,7 @@ class Registry:
             unknown = as_table(row for rows in read for row in rows)
         table = pa.concat_tables([old, new, unknown])
         table = table.filter(pc.is_in(table["folder"], value_set=pa.array(folders, pa.string())))
-        # Of the results of one source, the last stays.
+        # Only the last result of each source stays.
         finished = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
         finished = finished.aggregate([("finished", "max")])
         order = [("source", "ascending"), ("finished_max", "ascending"), ("folder", "ascending")]

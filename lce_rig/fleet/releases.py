@@ -56,7 +56,7 @@ def find_target(name: str, file: Path | None, session: Path, robot: str | None =
 
     Raises:
         ProfileError: the file is invalid.
-        UsageError: there is no target of this name, or it stands for many robots.
+        UsageError: the target is unknown, or it stands for many robots.
     """
     place = file or session.resolve().parent / TARGETS_FILE
     targets = read_targets(place) if file is not None or place.is_file() else {}
@@ -150,8 +150,8 @@ class TargetState:
     Attributes:
         current: read by robot software; None before the first deployment.
         releases: all that are kept, the newest first.
-        pending: the release whose command has not succeeded yet; "" where none is pending.
-        changed: current files that are not as they were deployed, and how they differ, where it was asked.
+        pending: the release whose command has not succeeded yet, or "".
+        changed: current files that differ from the deployed ones, and how they differ; empty if not asked.
     """
 
     current: ReleaseRecord | None = None
@@ -217,7 +217,7 @@ def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
 
 
 def user_name() -> str:
-    """Name the user and this computer; "" if the system has no name for them."""
+    """Return user@computer; "" if the system has no name for them."""
     with suppress(OSError, KeyError):
         return f"{getpass.getuser()}@{socket.gethostname()}"
     return ""
@@ -259,5 +259,5 @@ def differences(files: Mapping[str, str], expected: Mapping[str, str]) -> dict[s
 
 
 def differences_in_words(changes: Mapping[str, str]) -> str:
-    """List what `differences` gave in one line."""
+    """List the result of `differences` in one line."""
     return ", ".join(f"{name} {how}" for name, how in changes.items())

@@ -42,7 +42,7 @@ MOVED_COLUMNS = (
     *("verdict", "findings", "severities", "T_cam_lidar", "cov", "cov_shared"),
 )
 """Columns of the table that this module requires."""
-# Sensors that moved far from the CAD model fail by this; other errors say that the result is wrong.
+# Error of sensors far from the CAD model, whose results are usable; other errors mark them as wrong.
 _FAR = "verdict.far_from_nominal"
 # 0.01 mm and 0.0006 deg, so that a covariance of zeros can be inverted.
 _LEAST = 1e-10 * np.eye(6)
@@ -158,7 +158,7 @@ class FleetReport:
         n_rows: of its table.
         history: results compared in time.
         findings: robots that moved.
-        verdicts: (verdict, or status of what has no result), rows and robots, the most rows first.
+        verdicts: (verdict, or status of a session without result), rows and robots, the most rows first.
         causes: (severity, code) of missing, failed and marginal results, rows and robots, likewise.
     """
 
@@ -171,7 +171,7 @@ class FleetReport:
 
     @classmethod
     def of(cls, registry: Registry) -> "FleetReport":
-        """Make the report of a registry.
+        """Build the report of a registry.
 
         Raises:
             SessionError: the registry has no table, or it cannot be read.

@@ -1,4 +1,4 @@
-"""Put the newest results of many robots onto them, one after the other, until the first failure.
+"""Deploy the newest results of many robots to them, one after the other, until the first failure.
 
 Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.
@@ -35,7 +35,7 @@ class RobotState:
         folder: of its newest result in the registry.
         state: "waiting" until it was reached.
         to: the place of its files.
-        release: that is current there afterwards; "" if it is not known.
+        release: the current release there afterwards; "" if unknown.
         replaces: the release that it replaced; "" if there was none.
         detail: cause and action.
     """
@@ -75,9 +75,9 @@ class Rollout:
 
 
 def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]:
-    """Choose each robot's newest session; one without a usable result is left out, with the cause.
+    """Choose each robot's newest session; one without a usable result is skipped, with the cause.
 
-    An older result is never taken instead: the sensors may have been moved since.
+    An older result is never used instead, as the sensors may have been moved since.
 
     Args:
         registry: of the results.
@@ -111,17 +111,17 @@ def roll_out(
 ) -> Rollout:
     """Deploy to one robot after the other, until one fails.
 
-    Robots that hold their result are not written again. Robots that are left out stay so.
+    Robots that hold their result are not written again. Skipped robots stay unchanged.
 
     Args:
         registry: with the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
         file: that lists targets.
-        wanted: as `newest_results` gives them.
+        wanted: from `newest_results`.
         progress: called with (done, total) robots.
 
     Raises:
-        UsageError: there is no target of this name.
+        UsageError: the target is unknown.
         ProfileError: the file with the targets is invalid.
     """
     targets = read_targets(file)

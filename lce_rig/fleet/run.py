@@ -20,18 +20,19 @@ from lce_rig.fleet.work import Settings, first_row, publish, run_apart, without_
 
 # A session cannot kill its worker; a worker that died was killed from outside.
 _MOST_LOST_WORKERS = 100
-# The table is written again after so many times the time that it took; what is not in it is in the folders.
+# Interval between writes of the table: 100 times the last write's duration, at least 60 s. Results that are
+# not in the table yet are in the folders.
 _TABLE_SHARE, _TABLE_EVERY_S = 100, 60.0
 
 
 @dataclass
 class FleetRun:
-    """What a run did.
+    """The outcome of a run.
 
     Attributes:
         n_new: sessions that were run.
         n_held: sessions whose results the registry held.
-        statuses: how many sessions ended how, held ones included.
+        statuses: number of sessions by status, held ones included.
         causes: how many sessions have no result, by the code of the cause.
         table: the table, a `pyarrow.Table`.
     """
@@ -79,14 +80,14 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
     settings = {
         "distributed.scheduler.allowed-failures": _MOST_LOST_WORKERS,
         "distributed.scheduler.worker-saturation": 1.0,
-        # Workers wait for processes: what Dask watches in them, up to a hundred times a second, is of no use.
+        # Workers only wait for processes, so Dask's profiling of them, up to 100 times a second, is useless.
         "distributed.worker.profile.enabled": False,
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.system-monitor.interval": "2s",
         # Ctrl-C reaches all processes of a terminal; this one ends the workers.
         "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"],
     }
-    # Workers that end while their scheduler does are no news.
+    # Workers that end together with their scheduler are not worth a message.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with dask.config.set(settings):
         local = LocalCluster(
@@ -140,7 +141,7 @@ def run_fleet(
 
 
 def _rows_of(future: Any, job: Job, settings: Settings) -> list[Row]:
-    """Take a task's rows; of one that no worker survived, write the cause."""
+    """Return a task's rows; of one that no worker survived, a row with the cause."""
     try:
         rows: list[Row] = future.result()
         return rows

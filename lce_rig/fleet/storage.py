@@ -21,8 +21,8 @@ _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 class Storage:
     """A folder or file, by a path or by an address that fsspec knows.
 
-    All methods raise SourceError with one line if the place cannot be reached, for whatever reason a library
-    gives: missing credentials, no network, no permission.
+    All methods raise SourceError with one line if the place cannot be reached, for any reason that a library
+    reports: missing credentials, no network, no permission.
 
     Attributes:
         url: absolute; without a slash at its end.
@@ -68,7 +68,7 @@ class Storage:
 
     @contextmanager
     def reached(self) -> Iterator[tuple[Any, str]]:
-        """Give the file system that fsspec has for the place, and the path there; see the class."""
+        """Return fsspec's file system for the place, and the path there; see the class."""
         try:
             yield url_to_fs(self.url)
         except (LceRigError, *_ABSENT):
@@ -105,7 +105,7 @@ class Storage:
             fs.pipe_file(path, content)
 
     def names(self) -> list[str]:
-        """List what it holds as a folder, by name; nothing if there is no such folder."""
+        """List the names of a folder's entries, sorted; empty if the folder is missing."""
         try:
             with self.reached() as (fs, path):
                 entries = fs.ls(path, detail=False, **({} if self.local is not None else {"refresh": True}))
@@ -124,7 +124,7 @@ class Storage:
     def folders_with(self, marker: str) -> list[str]:
         """List the outermost folders below it that hold a file of this name, by their path in it.
 
-        The folder itself is "". Folders whose names begin with a dot are left out.
+        The folder itself is "". Folders whose names begin with a dot are skipped.
         """
         folders = []
         with self.reached() as (fs, path):
@@ -174,7 +174,7 @@ class Storage:
 
         Args:
             target: the copy, which must not exist.
-            without: names in the folder that are left out.
+            without: names in the folder that are skipped.
 
         Raises:
             OSError: it is not there, or cannot be written here.

@@ -51,7 +51,7 @@ class TargetSettings(Settings):
         run: a command to run there afterwards, by sh; $1 is the robot's name.
         run_timeout_s: time that it may take.
         ssh: options of ssh_config for the connection, such as Port and IdentityFile.
-        keep: so many releases are kept, the current one included.
+        keep: number of releases kept, the current one included.
     """
 
     to: Text
@@ -82,7 +82,7 @@ class TargetSettings(Settings):
         return self
 
     def for_robot(self, robot: str) -> "TargetSettings":
-        """Put a robot's name in place of {robot}; results of other robots are refused there.
+        """Return the settings with a robot's name for {robot}; results of other robots are refused there.
 
         Raises:
             ValueError: no robot can have this name.

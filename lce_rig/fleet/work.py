@@ -86,7 +86,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
     Args:
         job: the session.
         settings: of the run.
-        tell: called with the row of the session, as far as it is known, before the work begins.
+        tell: receives the row of the session, with the columns known so far, before the work begins.
 
     Returns:
         Its rows, with `is_new`; status "failed" for errors that the user can repair.
@@ -122,7 +122,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
             kind = next(kind for each, kind in findings.OF_ERRORS.items() if isinstance(error, each))
             cause = error.finding if isinstance(error, NotEnoughDataError) else None
             failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
-            # Name files by where the session lies.
+            # Files are named by the session's place.
             failed["detail"] = failed["detail"].replace(str(scratch / "session"), job.source)
             return publish(registry, [failed], start_s)
 
@@ -286,7 +286,7 @@ def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memo
     """Run a function in a process of its own and wait for its end.
 
     Args:
-        call: "module:function"; it gets the arguments, and a function `tell` that sends a row early.
+        call: "module:function"; it gets the arguments, and a function that sends a row early.
         arguments: JSON values.
         time_limit_s: after which the process is ended.
         memory_limit_mb: of data, beyond which its allocations fail.

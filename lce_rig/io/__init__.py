@@ -20,16 +20,16 @@ RECORDINGS = {
     **dict.fromkeys(sorted(_PACKETS), "lce_rig.io.velodyne_scans:PcapRecording"),
     **dict.fromkeys(sorted(_EVENTS), "lce_rig.io.events:EventCameraFile"),
 }
-"""Reader by suffix, or "folder"; imported when wanted."""
+"""Reader by suffix, or "folder"; imported on first use."""
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
 _CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
-    """Open what lies at a path: a folder of images and point clouds, a bag, or a file of an event camera.
+    """Open the recording at a path: a folder of images and point clouds, a bag, or a file of an event camera.
 
     Raises:
-        SourceError: nothing is there, or nothing that can be read.
+        SourceError: the path is missing, or no reader can open it.
     """
     path = Path(path)
     kind = recognise(path)
@@ -45,7 +45,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
 
 
 def recognise(path: Path) -> str:
-    """Name the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
+    """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
 
     Raises:
         SourceError: nothing is there, or no recording.
@@ -64,15 +64,15 @@ def recognise(path: Path) -> str:
 def open_recordings(
     paths: Iterable[Path], rig: Rig, options: SourceOptions | Sequence[SourceOptions] | None = None
 ) -> list[Recording]:
-    """Open what lies at several paths; a folder that several recorders filled gives each of their files.
+    """Open the recordings at several paths; a folder filled by several recorders yields each of their files.
 
     Args:
         paths: of the recordings.
         rig: the profile.
-        options: how they are read: all alike, or each by its own.
+        options: one for all recordings, or one per path.
 
     Raises:
-        SourceError: as `open_recording`; of a folder's files only where none of them can be read.
+        SourceError: as `open_recording`; for a folder only if none of its files can be read.
     """
     paths, options = list(paths), options or SourceOptions()
     by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options
@@ -95,15 +95,15 @@ def open_recordings(
 
 
 def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path, SourceOptions]]:
-    """List the recordings in a folder, with how each is read; anything else is one recording.
+    """List the recordings in a folder, with the options for each; any other path is one recording.
 
-    Bags come first: what several hold is taken from the first. A file named after a LiDAR or a camera of the
-    profile belongs to it.
+    Bags come first, because a sensor in several recordings is read from the first. A file named after a LiDAR
+    or a camera of the profile belongs to it.
 
     Args:
         path: a folder, such as `lce-rig collect --record` fills, or any recording.
         rig: the profile.
-        options: how it is read, where names of files do not say.
+        options: for reading, unless file names choose the sensor.
     """
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [(path, options)]
@@ -112,9 +112,9 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     folders, images = [entry for entry in entries if entry.is_dir()], list[Path]()
     if not all(kind_of(folder) in _BAGS for folder in folders):
         if not kinds[_PACKETS] or _holds_clouds(path):
-            return [(path, options)]  # Of images and point clouds, whatever lies beside them.
+            return [(path, options)]  # A folder of images and point clouds; other files in it are ignored.
         folders, images = [], [path]
-    # A bag in several pieces lies in one folder, and is read as one.
+    # A bag in several pieces is in one folder, and is read as one.
     bags = ([path] if kinds[_BAGS] else []) + folders
     is_one_of_many = len(bags) + len(images) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
     options = replace(options, is_part=options.is_part or is_one_of_many)

@@ -105,7 +105,7 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
 
 
 def suggest_models(elevations_deg: Array) -> list[str]:
-    """List the models whose beams have these elevations (L,) in deg, the most alike first."""
+    """List the models whose beams have these elevations (L,) in deg, the most similar first."""
     n = len(elevations_deg)
     alike = []
     for sheet in DATA_SHEETS:
@@ -123,7 +123,7 @@ def _fits(elevations_deg: Array, sheet: DataSheet) -> bool:
         return is_whole and _distance_deg(elevations_deg, sheet) <= _MAX_OF_UNIT_DEG
     low_deg, high_deg = min(sheet.elevations_deg), max(sheet.elevations_deg)
     reach_deg = max(low_deg - elevations_deg.min(), elevations_deg.max() - high_deg)
-    # The distance to the nearest beam is no test where beams are closer than those of one model differ.
+    # Where beams are closer together than those of two units of one model, the distance proves nothing.
     spacing_deg = float(np.median(np.diff(np.sort(sheet.elevations_deg))))
     is_dense = spacing_deg < _MAX_OF_UNIT_DEG
     is_near = is_dense or _distance_deg(elevations_deg, sheet) <= _MAX_OF_PART * spacing_deg

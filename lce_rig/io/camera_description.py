@@ -27,7 +27,7 @@ FORMS = (
     "camera_info of ROS (YAML, ost.txt, or of ros2 topic echo), Kalibr's camchain, OpenCV's FileStorage "
     "(YAML or XML) with camera_matrix, dist_coeffs, image_width and image_height, or FAST-LIVO2's camera"
 )
-# Descriptions are pages; a recording given by mistake is not parsed.
+# Maximum size: descriptions are a few pages, and a recording given by mistake is not parsed.
 _MAX_BYTES = 1 << 20
 _MAX_DEPTH = 6
 # Ends of keys of a second camera in one file, as OpenCV's stereo samples write them.
@@ -40,7 +40,7 @@ _COEFFICIENTS = (
 )
 _PROJECTION = ("projectionmatrix", "p")
 _RECTIFICATION = ("rectificationmatrix", "r")
-# Smaller angles are below what a calibration can tell.
+# Rotation by rectification below which a calibration sees no difference, deg.
 _TURNED_DEG = 0.005
 _SIZE = ("imagesize", "resolution", "imgsize", "size")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "camwidth"), ("imageheight", "height", "camheight")
@@ -61,14 +61,14 @@ class CameraDescription:
         K: (3, 3) px, at the full size.
         distortion: its coefficients.
         model: name of the distortion model, as `Intrinsics.from_ros` takes it.
-        size_px: (width, height) to which K belongs; zeros where it is not stated.
-        P: (3, 4) px, of rectified images; zeros where it is not stated.
-        turned_deg: angle by which rectification turns the camera's frame.
+        size_px: (width, height) to which K belongs; zeros if not stated.
+        P: (3, 4) px, of rectified images; zeros if not stated.
+        turned_deg: angle by which rectification rotates the camera's frame.
         binning: pixels of the sensor per pixel of the images, in x and y.
         roi_px: (x offset, y offset, width, height) that is read out, at the full size; a width and height of
             zero for all of it.
-        name: of the camera; "" where it has none.
-        topic: of its images; "" where none is named.
+        name: of the camera, or "".
+        topic: of its images, or "".
     """
 
     K: Array
@@ -85,10 +85,10 @@ class CameraDescription:
     def intrinsics(
         self, image_px: tuple[int, int] | None = None, *, is_rectified: bool = False
     ) -> tuple[Intrinsics, list[str]]:
-        """Return the intrinsics of the images, and what was done to the description, in words.
+        """Return the intrinsics of the images, and notes on the changes made to the description.
 
         Args:
-            image_px: (width, height) of the images; None where it is not known.
+            image_px: (width, height) of the images; None if unknown.
             is_rectified: whether their distortion has been removed.
 
         Raises:
@@ -182,10 +182,10 @@ def is_rectified(topic: str) -> bool:
 
 
 def describe_message(info: Any) -> CameraDescription:
-    """Take the fields of a sensor_msgs/CameraInfo of ROS 1 or ROS 2.
+    """Read the fields of a sensor_msgs/CameraInfo of ROS 1 or ROS 2.
 
     Raises:
-        ValueError: a field is not as it has to be.
+        ValueError: a field is invalid.
     """
     names = ("distortion_model", "width", "height", "binning_x", "binning_y", "k", "d", "p", "r")
     fields = {name: getattr(info, name, None) for name in names}
@@ -218,7 +218,7 @@ class CameraFile:
         Args:
             name: of the camera, which chooses among several.
             topics: of its images, which choose among several, too.
-            image_px: (width, height) of its images; None where it is not known.
+            image_px: (width, height) of its images; None if unknown.
 
         Raises:
             UsageError: there are several cameras, and none of this name or topic.
@@ -269,7 +269,7 @@ def _documents(data: bytes) -> Iterator[Any]:
     else:
         import yaml
 
-        # OpenCV's directive and tags are no YAML; what they mark reads as plain mappings.
+        # OpenCV's directive and tags are not valid YAML; without them the rest reads as plain mappings.
         text = re.sub(r"^%YAML.*\n|!!opencv-[a-z-]+", "", text)
         yield from yaml.safe_load_all(text)
 
@@ -391,7 +391,7 @@ def _one_camera(flat: Mapping[str, Any], K: Array, side: str, name: str) -> Came
 
 
 def _model_name(flat: Mapping[str, Any]) -> str:
-    """Return the distortion model's name as stated; radtan, as OpenCV orders coefficients, where none is."""
+    """Return the distortion model's name as stated; by default radtan, OpenCV's order of coefficients."""
     if any(str(flat.get(key, "")).lower() in ("1", "1.0", "true", "yes") for key in _FISHEYE):
         return "equidistant"
     stated = next((flat[key] for key in _MODEL if isinstance(flat.get(key), str)), "radtan")

@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.ring_apex import MAX_APEX_M, find_apex
 from lce_rig.rig import LidarSettings
 
-# Of rings that are inferred: bin of elevation, most of them, and how far a laser lies above the origin.
+# Inferred rings: bin of elevation, maximum number, maximum height of a laser above the origin.
 BIN_RAD = np.radians(0.02)
 MAX_RINGS = 256
 MAX_OFFSET_M = 0.015
@@ -41,13 +41,13 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
     A laser mounted h above the origin of the frame and inclined by alpha draws the line
     z = rho tan(alpha) + h over the distance rho from the vertical axis. The lines are found as peaks of
     elevation among the far points, where h (11 mm at most on a VLP-16) hardly bends them, and refitted with
-    all points; what no line explains is searched again, for lasers that see little or only what is near.
+    all points. The points left over are searched again, for lasers with few points or near points only.
 
     Args:
-        points_lidar: (N, 3) m, frame lidar (z along the axis of rotation); NaN where there is no return.
+        points_lidar: (N, 3) m, frame lidar (z along the axis of rotation); NaN for a missing return.
 
     Returns:
-        (N,) int16; -1 where the point is not finite or lies at the origin.
+        (N,) int16; -1 for a point that is not finite or at the origin.
 
     Raises:
         SourceError: the elevations form no rings, as with a solid-state LiDAR or a point cloud that was
@@ -127,7 +127,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
         count = np.maximum(np.bincount(ring, minlength=n), 1)
         mean_x, mean_y = np.bincount(ring, x, n) / count, np.bincount(ring, y, n) / count
         dx, dy = x - mean_x[ring], y - mean_y[ring]
-        # A prior holds the offset at zero where a ring sees a single distance (0.1 mrad against 15 mm).
+        # A prior keeps the offset near zero for a ring that sees a single distance (0.1 mrad against 15 mm).
         prior = (1e-4 / MAX_OFFSET_M) ** 2 * count
         offset = np.bincount(ring, dx * dy, n) / (np.bincount(ring, dx * dx, n) + prior)
         offset = np.clip(offset, -MAX_OFFSET_M, MAX_OFFSET_M)
@@ -138,7 +138,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
     return lines
 
 
-# NaN and values beyond a type's range are checked where they matter.
+# NaN and values beyond a type's range are checked at the places that use them.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
@@ -154,11 +154,11 @@ def to_scan(
     Args:
         cloud: structured (N,) with at least x, y, z in m, frame lidar.
         lidar: the LiDAR's name in the profile.
-        settings: its settings; `timestamps.reference` says which firing `stamp_ns` marks.
+        settings: its settings; `timestamps.reference` names the firing that `stamp_ns` marks.
         where: file or topic, for messages.
-        stamp_ns: the point cloud's timestamp as recorded; None where there is none.
+        stamp_ns: the point cloud's timestamp as recorded, or None.
         host_ns: arrival at the host.
-        notes: receives what the point cloud lacks or how it was understood, in words.
+        notes: receives the missing fields and the assumptions made, in words.
 
     Returns:
         The points with a return: finite, neither at the origin nor above or below it, and not nearer than
@@ -187,7 +187,7 @@ def to_scan(
     is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
     if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
-    # Returns of the LiDAR's housing and mount, which lie on no ring and are not used.
+    # Returns of the LiDAR's housing and mount are on no ring and are not used.
     is_far = is_kept & (np.hypot(flat_m, z) >= settings.min_range_m)
     if not is_far.any():
         raise SourceError(
@@ -266,7 +266,7 @@ def _ring(
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
     is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
     # Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
-    # points may swap their mean elevations, which is no reason to renumber: Spearman's correlation decides.
+    # points may swap their mean elevations; they keep their numbers if Spearman's correlation is high.
     rises = bool((np.diff(rank) > 0).all())
     if len(rank) >= 3:
         rises = bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
@@ -289,7 +289,7 @@ def _refuse_other_frame(points: NDArray[np.float32], ring: NDArray[np.int16], wh
 
 
 def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[str]) -> NDArray[np.int16]:
-    """Number the rings by elevation, because of a cause; say both in the error where there are none."""
+    """Number the rings by elevation; without rings, raise a SourceError that includes the cause."""
     try:
         ring = rings_from_elevation(points)
     except SourceError as error:
@@ -301,10 +301,10 @@ def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[st
 def _ring_thickness_deg(
     ring: NDArray[np.intp], elevation: NDArray[np.float64], points: NDArray[np.float32]
 ) -> float:
-    """Compute the scatter of elevation of one ring in one direction: the median standard deviation, deg.
+    """Compute the median standard deviation of the elevation of one ring in one direction, deg.
 
-    Directions are told apart because a cloud in another frame may be tilted; the median because near
-    returns show where in the sensor a beam begins.
+    Each direction counts separately because a point cloud in another frame may be tilted. The median is used
+    because near returns are shifted by the beam's offset inside the sensor.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     cell = ring * _N_DIRECTIONS + ((azimuth / (2 * np.pi) + 0.5) * (_N_DIRECTIONS - 1)).astype(np.intp)
@@ -348,31 +348,31 @@ def _times(
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns
-    # velodyne_pointcloud gives times relative to the timestamp: negative where that marks the last packet.
+    # velodyne_pointcloud gives times relative to the timestamp: negative if it marks the last packet.
     return offset_ns, stamp_ns + first_ns
 
 
 def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
-    """Bring a time field to integers or float64; None where it is constant, not finite or rounded away."""
+    """Convert a time field to integers or float64; None if it is constant, not finite or rounded away."""
     if values.dtype.kind in "iu":
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
     ticks = values.astype(np.float64)
-    # Beyond a century of nanoseconds it is not a time in any unit.
+    # More than a century in nanoseconds is not a time in any unit.
     if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None
-    # A float32 of Unix time moves in steps of two minutes.
+    # The resolution of a float32 of Unix time is two minutes.
     step = float(np.spacing(np.abs(values).max()))
     return ticks if np.ptp(ticks) > 1000 * step else None
 
 
 def _unit(ticks: NDArray[Any]) -> str | None:
-    """Return the unit from how long the scan lasts; None where it lasts longer than any, in any unit."""
+    """Return the unit that fits the scan's duration; None if the duration is too long in every unit."""
     span = float(ticks.max()) - float(ticks.min())
     for unit, scale in NS_PER_UNIT.items():
         if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:
             return unit
-    # A sector of a scan may be shorter than any scan: then it is the usual unit of the type.
+    # A sector of a scan may be shorter than any scan; it has the usual unit of its type.
     usual = _usual_unit(ticks)
     return usual if span * NS_PER_UNIT[usual] * 1e-9 < SWEEP_S[0] else None
 

@@ -18,11 +18,11 @@ from lce_rig.core.pcd import decode_pcd
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 _MAX_SAMPLED = 1 << 24
-# Of LAS: minor version, bytes of the header, offset of points, number of records, bytes and number of points;
-# offset and number of extended records, number of points. Bytes of the head of a record.
+# LAS header: minor version, bytes of the header, offset of points, number of records, bytes and number of
+# points; LAS 1.4: offset and number of extended records, number of points. Bytes of a record's head.
 _LAS_HEADER, _LAS_14 = struct.Struct("<25xB68xHIIxHI"), struct.Struct("<235xQIQ")
 _VLR_BYTES, _EVLR_BYTES = 54, 60
-# Of PLY: by the names of its properties' types, and by its formats.
+# PLY types by the names of its properties' types, and byte orders by its formats.
 _KINDS = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
     **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
@@ -48,7 +48,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     """Decode a PNG, JPEG or other image file held in memory.
 
     Raises:
-        ValueError: what is wrong with it.
+        ValueError: the data are damaged or not an image; the text has the reason.
     """
     import cv2
 
@@ -109,7 +109,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
             element = words[1]
             sizes[element], columns[element] = int(words[2]), []
         elif words[0] == "property" and (words[1] != "list" or "vertex" not in sizes or element == "vertex"):
-            # Lists behind the vertices, such as corners of faces, are not read.
+            # Lists after the vertices, such as corners of faces, are not read.
             columns[element].append((words[2], _ORDERS[encoding] + _KINDS[words[1]]))
         elif words[0] == "end_header":
             break

@@ -39,7 +39,7 @@ Pairs: TypeAlias = list[tuple[int, int]]
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Give a sort key that puts "scan2" before "scan10"."""
+    """Return a sort key that puts "scan2" before "scan10"."""
     return [
         (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
     ]
@@ -69,14 +69,14 @@ def pair_names(
 ) -> tuple[Pairs, str]:
     """Match images, or another LiDAR's point clouds, and point clouds by their names (without suffix).
 
-    Equal names are taken where nine in ten match; else the nearest time, where names are times and nine in
-    ten find a partner within the tolerance; else sorted order, where there are as many images as point
-    clouds; else the better of the first two.
+    Equal names are used if nine in ten match; else the nearest time, if names are times and nine in ten find
+    a partner within the tolerance; else sorted order, if images and point clouds are equal in number; else
+    the better of the first two.
 
     Args:
         images, clouds: names in natural order.
         tolerance_s: largest difference in time.
-        may_count: whether sorted order will do.
+        may_count: whether sorted order is allowed.
 
     Returns:
         The pairs, and how they were found, in words.
@@ -85,7 +85,7 @@ def pair_names(
         SourceError: no name matches.
     """
     n, image_ns, cloud_ns = len(images), parse_times(images), parse_times(clouds)
-    # An image of the same name in another format makes a pair of its own.
+    # An image of the same name in another format makes a separate pair.
     place = {name: j for j, name in reversed(list(enumerate(clouds)))}
     by_name = [(i, place[name]) for i, name in enumerate(images) if name in place]
     candidates: list[tuple[Pairs, str]] = [(by_name, "paired by equal file names")]
@@ -111,7 +111,7 @@ def pair_names(
 
 
 def _nearest_pairs(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float) -> Pairs:
-    """Pair what is nearest in time to each other, both ways."""
+    """Pair images and point clouds that are each other's nearest in time, within the tolerance."""
     by_image, by_cloud = np.argsort(image_ns, kind="stable"), np.argsort(cloud_ns, kind="stable")
     cloud_of = by_cloud[nearest(image_ns, cloud_ns[by_cloud])]
     image_of = by_image[nearest(cloud_ns, image_ns[by_image])]
@@ -126,7 +126,7 @@ def _by_sensor(
     """List the files in folders named after sensors: img/left/ and img/right/, or left/ and right/.
 
     Returns:
-        Files by sensor, in the order of `sensors`; empty where no folder is named after one.
+        Files by sensor, in the order of `sensors`; empty if no folder is named after a sensor.
     """
     above = [path for name, path in _folders(folder).items() if name in names and name not in sensors]
     for place in (*above, folder):
@@ -145,7 +145,7 @@ def list_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """List the images and the point clouds of one camera and one LiDAR in a folder, unread.
 
     Returns:
-        Images, empty where there are none or several cameras'; point clouds.
+        Images, empty if missing or from several cameras; point clouds.
 
     Raises:
         SourceError: no point clouds, or those of several LiDARs.
@@ -160,10 +160,10 @@ def list_files(folder: Path) -> tuple[list[Path], list[Path]]:
 def _list(
     folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
 ) -> list[Path]:
-    """List the files of one kind in the folder whose name says so, else in the only one that has any.
+    """List the files of one kind in the folder named for it, else in the only one that has any.
 
     Raises:
-        SourceError: there are none, or several folders have some and no name says which is meant.
+        SourceError: there are none, or several folders have some and none is named for them.
     """
     folders = _folders(folder)
     holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
@@ -248,7 +248,7 @@ class PlacementOnDisk:
         return digest.hexdigest()
 
     def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
-        """Decode all files; also says, in words, what was assumed or skipped.
+        """Decode all files; also return notes on assumptions and skipped points, in words.
 
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
@@ -266,7 +266,7 @@ class PlacementOnDisk:
 
 
 def _stamps_ns(files: Sequence[Path]) -> list[int | None]:
-    """Read the times in files' names; None for each where they hold none."""
+    """Read the times in files' names; None for each if the names are not times."""
     times_ns = parse_times([file.stem for file in files])
     return [None] * len(files) if times_ns is None else times_ns.tolist()
 
@@ -275,7 +275,7 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     """List the images of each camera.
 
     Raises:
-        SourceError: there are none, or none of the camera that was asked for, or their camera is not known.
+        SourceError: there are none, or none of the requested camera, or their camera is not known.
     """
     found = _by_sensor(folder, rig.cameras, IMAGE_FOLDERS, SUFFIXES) if len(rig.cameras) > 1 else {}
     if options.camera in found:
@@ -325,11 +325,11 @@ def _clouds(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
 
 
 class ImagesRecording:
-    """Images whose names are times, beside another's scans of the same moment; see `ContinuousRecording`.
+    """Images named by time, recorded along with another recording's scans; see `ContinuousRecording`.
 
     Attributes:
         path: the folder.
-        notes: what was chosen, and after reading the images that could not be read.
+        notes: choices made, and after reading the images that could not be read.
         key: fingerprint of the first and the last image of each camera, and of their number.
         n_samples: number of images.
         streams: the images of each camera.
@@ -392,7 +392,7 @@ class FolderRecording:
 
     Attributes:
         path: the folder.
-        notes: how pairs were found and what was left over.
+        notes: the rule of pairing, and the files without a partner.
         pairs: every point cloud with its images, or other LiDARs' point clouds, by name of the point cloud.
     """
 
@@ -417,7 +417,7 @@ class FolderRecording:
             )
         else:
             clouds, *others = images
-        # The second image of one camera that goes with a point cloud makes a pair of its own.
+        # The second image of one camera that goes with a point cloud makes a separate pair.
         together: dict[tuple[int, int], list[FileOnDisk]] = {}
         lone: list[str] = []
         for of_sensor, pairs in zip(others, self._pair(others, clouds), strict=True):

@@ -18,8 +18,8 @@ from lce_rig.rig import DriverSettings
 
 _NS_PER_S = 1_000_000_000
 FRAME_BYTES = 58
-"""Of a recorded datagram beside its payload: headers of pcap, Ethernet, IP and UDP."""
-# So many packets, per second or less of one sensor, show which sensors were recorded.
+"""Bytes of a recorded datagram besides its payload: headers of pcap, Ethernet, IP and UDP."""
+# Packets read to find a recording's sensors (1 s or less of one sensor); reasons listed in an error.
 _N_SURVEYED, _MAX_SHOWN = 800, 6
 # Class of a frame by link type, https://www.tcpdump.org/linktypes.html.
 _FRAMES: dict[int, Any] = {
@@ -56,7 +56,7 @@ class PcapFile:
     Attributes:
         path: the file.
         losses: datagrams that are not whole; grows while the file is read.
-        damage: the reason for which the file could not be read to its end; "" where it could.
+        damage: the reason if the file could not be read to its end, else "".
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +83,7 @@ class PcapFile:
         with BoundedPath(self.path).open("rb") as file:
             try:
                 for stamp_s, raw in dpkt.pcap.UniversalReader(file):
-                    # dpkt gives stamps of ns as exact decimals and others as floats, which hold a us.
+                    # dpkt returns timestamps of ns as exact decimals, others as floats with 1 us resolution.
                     is_exact = isinstance(stamp_s, Decimal)
                     host_ns = int(stamp_s * _NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
                     datagram = self._read(raw, host_ns)
@@ -98,8 +98,8 @@ class PcapFile:
         """Choose the sensor (address, port sent to) by the start of the file: the profile's, or the only one.
 
         Args:
-            explain: returns why a datagram is none of the LiDAR's, in words; "" for those that are.
-            what: the LiDAR whose packets are wanted, in words.
+            explain: returns the reason for a datagram that is not from the LiDAR; "" for one that is.
+            what: description of the LiDAR, for messages.
             lidar: its name in the profile.
             driver: its `driver` there.
 
@@ -133,7 +133,7 @@ class PcapFile:
         return findings.worded(self.losses) + ([self.damage] if self.damage else [])
 
     def _read(self, raw: bytes, host_ns: int) -> Datagram | None:
-        """Take the UDP datagram out of a frame; None where there is no whole one."""
+        """Extract the UDP datagram from a captured frame; None if incomplete or not UDP."""
         try:
             packet = _FRAMES[self._link](raw)
         except dpkt.Error:

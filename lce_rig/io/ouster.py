@@ -23,7 +23,7 @@ from lce_rig.io.network import FRAME_BYTES, PcapFile
 from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
-# A scan with more of its columns lost is not worth looking at.
+# Minimum share of a scan's columns that must arrive.
 _MIN_COVERAGE = 0.5
 
 
@@ -59,7 +59,7 @@ PROFILES = {
     "RNG19_RFL8_SIG16_NIR16": Profile(_pixel(4, "u1", 12), 1e-3, (1 << 19) - 1),
     "RNG15_RFL8_NIR8": Profile(_pixel(2, "u1", 4, "<u2"), 8e-3, (1 << 15) - 1),
 }
-"""The profiles of one return that are read."""
+"""Supported profiles of single returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ class OusterRecording:
         """Find the metadata and the sensor's packets.
 
         Raises:
-            SourceError: there are no metadata, of a profile that is not read, or no packets that fit them.
+            SourceError: the metadata are missing or of an unsupported profile, or no packet fits them.
         """
         self.path = path
         self.notes: list[str] = []
@@ -251,7 +251,7 @@ class OusterRecording:
             yield packets, first_host_ns
 
     def _to_scan(self, packets: NDArray[np.void], first_host_ns: int) -> Scan | None:
-        """Make the scan of a frame's packets (P,); None where too few of its columns came."""
+        """Build the scan of a frame's packets (P,); None if too few of its columns arrived."""
         metadata, settings = self._metadata, self._settings
         columns = packets["columns"].reshape(-1)
         number = columns["column"].astype(np.int64)

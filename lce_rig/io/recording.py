@@ -36,10 +36,10 @@ class SourceOptions:
     """Options for reading a recording; they override the profile.
 
     Attributes:
-        camera, channel, lidar: of a folder's images and point clouds; None takes the rig's first channel and
-            LiDAR, and its camera where it has one only or folders are named after them.
+        camera, channel, lidar: sensors of a folder's images and point clouds; None takes the rig's first
+            channel and LiDAR, and the camera from folders' names or the rig's only camera.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
-        is_part: whether other recordings of the same moment hold what this one lacks.
+        is_part: whether other recordings of the same moment hold the sensors missing here.
     """
 
     camera: str | None = None
@@ -53,8 +53,8 @@ class Recording(Protocol):
     """Anything recorded.
 
     Attributes:
-        path: where it lies.
-        notes: what was chosen, assumed or missing, in words; grows while it is read.
+        path: file or folder.
+        notes: choices, assumptions and missing data, in words; grows while it is read.
     """
 
     path: Path
@@ -68,7 +68,7 @@ class ContinuousRecording(Recording, Protocol):
     Attributes:
         key: fingerprint of the recording.
         n_samples: number of images and scans to come, for progress.
-        streams: what is in it.
+        streams: the sensor channels in it.
     """
 
     key: str
@@ -76,12 +76,12 @@ class ContinuousRecording(Recording, Protocol):
     streams: Set[Stream]
 
     def samples(self) -> Iterator[Sample]:
-        """Yield what the sensors saw, in order of time; events in packets."""
+        """Yield images, scans and event packets, in order of time."""
         ...
 
 
 def serials_of(recording: Recording) -> dict[str, str]:
-    """Give the serial numbers of sensors that a recording tells, by sensor; most tell none.
+    """Return the serial numbers in a recording, by sensor; empty for most recordings.
 
     A reader that knows them has an attribute `serials`.
     """
@@ -103,13 +103,13 @@ def fingerprint(files: Iterable[Path]) -> str:
 def choose_camera(
     rig: Rig, options: SourceOptions, notes: list[str], camera: str | None = None
 ) -> tuple[str, str]:
-    """Name the (camera, channel) that a folder's images belong to: as asked, else the rig's only camera.
+    """Choose the (camera, channel) of a folder's images: as asked, else the rig's only camera.
 
     Args:
         rig: the profile.
-        options: what was asked for.
-        notes: takes what was chosen.
-        camera: that the folder itself names; None where it does not.
+        options: the user's choice.
+        notes: receives the choice, in words.
+        camera: camera named by the folder itself, or None.
 
     Raises:
         SourceError: the rig has no such camera or channel, or several cameras and none was named.
@@ -117,7 +117,7 @@ def choose_camera(
     camera = camera or options.camera
     if camera is None:
         camera, *others = rig.cameras
-        if others:  # Images of one that are taken for another's would spoil both extrinsics.
+        if others:  # Images assigned to the wrong camera would spoil both extrinsics.
             raise SourceError(
                 f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
                 f"Name it with --camera {camera}, or put each camera's images into a folder of its name: "
@@ -135,7 +135,7 @@ def choose_camera(
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
-    """Name the LiDAR that a folder's point clouds belong to: as asked, else the rig's first.
+    """Choose the LiDAR of a folder's point clouds: as asked, else the rig's first.
 
     Raises:
         SourceError: the rig has no such LiDAR.
@@ -151,7 +151,7 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
 
 
 def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
-    """Name the (camera, channel) that a file of events belongs to: as asked, else the first with events.
+    """Choose the (camera, channel) of a file of events: as asked, else the first with events.
 
     Raises:
         SourceError: the rig has no camera with a channel of kind events, or not the one asked for.
@@ -296,8 +296,8 @@ def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: 
 def join_recordings(recordings: Sequence[Recording], rig: Rig) -> list[Recording]:
     """Join continuous recordings of the same moment, in the order given.
 
-    A recording is of the same moment as those before it where it repeats no LiDAR, and adds a sensor or no
-    lone LiDAR follows that it could belong to; what else it repeats is skipped.
+    A recording belongs to those before it if it repeats no LiDAR, and either adds a sensor or no later
+    recording holds only a LiDAR. Other repeated sensors are skipped.
     """
     groups: list[list[Recording]] = []
     for place, recording in enumerate(recordings):
@@ -325,7 +325,7 @@ def _belongs(recording: Recording, group: Sequence[Recording], later: Sequence[R
 
 
 def require_sensors(recording: ContinuousRecording, rig: Rig) -> None:
-    """Make sure that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
+    """Check that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
 
     Raises:
         SourceError: it does not; the hint names the recording to add.
@@ -359,7 +359,7 @@ class JoinedRecording:
 
     Attributes:
         path: of the first.
-        notes: those of all, and what was skipped.
+        notes: those of all, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.
@@ -394,7 +394,7 @@ class JoinedRecording:
             self.notes += [n for part in self._parts for n in part.notes if n not in self.notes]
 
     def _owned(self, part: ContinuousRecording) -> Iterator[Sample]:
-        """Yield the samples of the streams that are taken from a part."""
+        """Yield the samples of the streams that are read from a part."""
         return (
             sample for sample in part.samples() if self._owner.get(stream_of(sample, self._rig), part) is part
         )

@@ -81,7 +81,7 @@ class PositionPacket(NamedTuple):
     Attributes:
         us: time past the hour on the sensor's counter.
         pps: index into velodyne.PPS_STATES.
-        nmea_s: second past the hour of the sentence it last received; None where it is no sound $GPRMC.
+        nmea_s: second past the hour in the last sentence received; None without a valid $GPRMC.
         is_fix: whether that sentence claims to be valid (status A).
     """
 
@@ -144,7 +144,7 @@ def _is_even(azimuth: Sequence[int], is_dual: bool, block_ns: int) -> bool:
 
 
 def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
-    """Read what the sensor reports of its clock.
+    """Decode a position packet, the sensor's report on its clock.
 
     Raises:
         BadPacketError: it is not a position packet.
@@ -175,7 +175,7 @@ def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
 
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
-# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
+# Position packets arrive 50 to 150 times per second and repeat a sentence until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
 # The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
@@ -206,7 +206,7 @@ class VelodyneClock:
         self._delays_ns.clear()
 
     def see_data(self, packet: DataPacket, elapsed_ns: int) -> None:
-        """Take note of an arrival.
+        """Record an arrival.
 
         Args:
             packet: in its place.
@@ -222,16 +222,16 @@ class VelodyneClock:
         self._delays_ns.append((window, delay_ns))
 
     def ahead_ns(self) -> int | None:
-        """Compute by how much the sensor's time is ahead of the host's; None where that is unknown.
+        """Compute the lead of the sensor's time over the host's, ns; None if the host's is unknown.
 
         The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
-        arrival; what is left is the host's time of the first firing, late by the network's delay.
+        arrival. The result is the host's time of the first firing, late by the network's delay.
         """
         host_ns = self._host_ns(self._last_elapsed_ns)
         return None if host_ns is None else resolve_hour(1000 * self._last_us, host_ns) - host_ns
 
     def stamp_ns(self, elapsed_ns: int) -> int | None:
-        """Stamp a moment of the counter, with the sensor's time where it can be trusted, else the host's."""
+        """Return the time of a counter value, ns: the sensor's time if it can be trusted, else the host's."""
         host_ns = self._host_ns(elapsed_ns)
         if host_ns is None or not self.is_utc:
             return host_ns
@@ -243,7 +243,7 @@ class VelodyneClock:
         return self._state() is findings.LIDAR_UTC
 
     def state(self) -> Finding:
-        """Report the clock that scans are timestamped with, and the reason where it is not the sensor's."""
+        """Report the clock of the scans' timestamps, and the reason for not using the sensor's."""
         ahead_ns, position = self.ahead_ns(), self.position
         figures: dict[str, Figure] = {} if ahead_ns is None else {"ahead_s": ahead_ns * 1e-9}
         if position is not None:
@@ -254,8 +254,8 @@ class VelodyneClock:
     def _state(self) -> Kind:
         """Find the first reason not to trust the sensor's time.
 
-        It is trusted where it is locked to pulses, the sentence it holds is of the second that its counter
-        shows, and the host's clock agrees.
+        It is trusted if the clock is locked to pulses, the NMEA sentence matches the second of the counter,
+        and the host's clock agrees.
         """
         position, ahead_ns = self.position, self.ahead_ns()
         if not self._is_device_wanted:

@@ -31,15 +31,15 @@ from lce_rig.io.velodyne_packets import (
 )
 from lce_rig.rig import LidarSettings, Rig
 
-#: What a recording made elsewhere may lack.
+#: Note on recordings, as those of another driver may omit the lasers' vertical offsets.
 OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm), which ROS 1 drivers omit"
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
-# So many packets ahead are believed whatever the host's clock says; beyond, both clocks must agree.
+# Packets ahead that are accepted without the host's clock; beyond, both clocks must agree.
 _MAX_BLIND = 4
 _MAX_DISAGREEMENT_NS = 20_000_000
-# A scan with more of its packets lost is not worth looking at.
+# Minimum share of a scan's packets that must arrive.
 _MIN_COVERAGE = 0.5
 
 
@@ -52,11 +52,11 @@ def read_controls(sensor: str, settings: LidarSettings) -> tuple[int, float]:
 
     Returns:
         The UDP port of position packets (`position_port`), and the direction of the seam between two scans
-        (`cut_deg`), rad from the lidar frame's x axis towards y; by default behind the sensor, where no
-        camera looks.
+        (`cut_deg`), rad from the lidar frame's x axis towards y; by default behind the sensor, out of the
+        cameras' view.
 
     Raises:
-        SourceError: a key is unknown, or its value cannot be meant.
+        SourceError: a key is unknown, or its value is out of range.
     """
     controls = settings.driver.controls
     where = f"lidars.{sensor}.driver.controls"
@@ -76,7 +76,7 @@ class _Piece(NamedTuple):
     """Blocks of one packet that belong to one revolution.
 
     Attributes:
-        packet: as it came.
+        packet: the whole packet.
         elapsed_ns: of the counter at the packet's first firing.
         blocks: the slice of its blocks.
     """
@@ -93,7 +93,7 @@ class Vlp16Stream:
         n_data, n_position: data and position packets that passed the checks.
         n_scans: revolutions handed on.
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
-        product: the model whose packets are taken.
+        product: the model whose packets are decoded.
         other_models: data packets of other models, by name.
         clock: of the timestamps.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
@@ -118,7 +118,7 @@ class Vlp16Stream:
             )
         self.product = product
         self._sensor = sensor
-        # Of the sensor's counter since the first packet; hours are counted on, and steps excluded.
+        # Time of the sensor's counter since the first packet, ns; hours are added, and steps excluded.
         self._elapsed_ns = 0
         self._last: DataPacket | None = None
         import velodyne_decoder  # type: ignore[import-untyped]
@@ -144,7 +144,7 @@ class Vlp16Stream:
         return [loss for loss in self.losses.findings() if loss.code in kinds]
 
     def push_position(self, payload: bytes | memoryview) -> None:
-        """Take a position packet; a bad one is counted."""
+        """Decode a position packet; a bad one is counted."""
         try:
             self.clock.position = read_position_packet(payload)
         except BadPacketError as error:
@@ -153,7 +153,7 @@ class Vlp16Stream:
         self.n_position += 1
 
     def push_data(self, payload: bytes | memoryview, host_ns: int) -> Scan | None:
-        """Take a data packet; returns the scan that it completes. A bad one is counted.
+        """Decode a data packet; return the scan that it completes. A bad one is counted.
 
         Args:
             payload: of the UDP packet.
@@ -179,7 +179,7 @@ class Vlp16Stream:
         return self._add(packet)
 
     def finish(self) -> Scan | None:
-        """End the stream; returns the last scan where it is whole but for the packet that would close it."""
+        """End the stream; return the last scan if only its closing packet is missing."""
         if not self._pieces:
             return None
         packet = self._pieces[-1].packet
@@ -195,8 +195,7 @@ class Vlp16Stream:
 
         Returns:
             "late" for a packet to skip: it was sent before another that has arrived, or twice;
-            "after a step" where the sensor's clock was set, as it is when it locks to a pulse, or its return
-            mode.
+            "after a step" if the sensor's clock (as when it locks to a pulse) or its return mode was set.
         """
         last, self._last = self._last, packet
         if last is None:
@@ -220,7 +219,7 @@ class Vlp16Stream:
         return "after a step"
 
     def _add(self, packet: DataPacket) -> Scan | None:
-        """Add a packet to its revolution, or to two where the rotor passes the cut within it."""
+        """Add a packet to its revolution, or to two if the rotor passes the cut within it."""
         past_cut = (packet.azimuth - self._cut) % velodyne.AZIMUTH_STEPS
         scan = None
         if self._pieces:
@@ -290,7 +289,7 @@ class Vlp16Stream:
             Of the points in the order of firing: (N, 3) float32 m in frame lidar; (N,) float32 reflectivity,
             0 to 255; (N,) int16 ring, 0 = lowest; (N,) int64 ns after the first packet's first firing.
         """
-        # The library completes the hour by the host's time: a clock that agrees past the hour will do.
+        # The library completes the hour from the host's time, so a clock that agrees past the hour is enough.
         zero_s = 3600.0 + int(packets["us"][0]) * 1e-6
         vector = self._library.PacketVector()
         for packet, at_ns in zip(packets, start_ns, strict=True):
@@ -303,10 +302,10 @@ class Vlp16Stream:
 
 
 def keep_brighter(packets: NDArray[np.void]) -> None:
-    """Blank, in dual-mode packets (P,), the darker of two returns, or the last where they are alike.
+    """Blank the darker of two returns in dual-mode packets (P,), or the last of two equal ones.
 
-    A board and the wall behind it may both answer one pulse at the board's rim; the brighter answer is what
-    the sensor reports in its strongest mode.
+    At the board's rim, board and wall may both answer one pulse; the sensor reports the brighter answer in
+    its strongest mode.
     """
     returns = packets["blocks"]["returns"]
     last, strongest = returns[:, 0::2], returns[:, 1::2]

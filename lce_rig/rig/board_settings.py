@@ -8,7 +8,7 @@ from lce_rig.core.board import Board, BoardType
 from lce_rig.core.pattern import DICTIONARIES, LEAST_CORNERS, n_markers_of
 from lce_rig.rig.settings import Figure, Settings, problem
 
-# Beyond these the figure is in millimetres.
+# Limits of sizes, m; figures beyond them are in millimetres.
 _Side = Annotated[float, Field(ge=0.005, le=5)]
 _Deviation = Annotated[float, Field(ge=0, le=0.2)]
 _LEAST_SQUARE_M = 0.001
@@ -21,7 +21,7 @@ KEYS_OF_TYPE: dict[BoardType, tuple[str, ...]] = {
     "aprilgrid": ("tags", "tag_spacing"),
     "plain": (),
 }
-# Corners by the parts that the profile counts: factor, and what is added.
+# Corners per axis from the profile's number of parts: factor, and number added.
 _CORNERS_OF_TYPE: dict[BoardType, tuple[int, int]] = {
     "checkerboard": (1, 0),
     "charuco": (1, -1),

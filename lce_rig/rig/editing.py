@@ -1,6 +1,6 @@
 """Edits of a profile's text that keep comments and layout.
 
-PyYAML's marks tell where a key's text begins and ends. ruamel.yaml would keep comments, too, but it ties each
+PyYAML's marks give the start and end of a key's text. ruamel.yaml would keep comments, too, but it ties each
 comment to the key above it: a key added to or removed from a block takes the next block's comments along.
 """
 
@@ -56,7 +56,7 @@ def edit_text(text: str, settings: Sequence[tuple[str, str]], source: str) -> st
 
 
 def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[str, str]]:
-    """List what `edit_text` sets for a camera's lens.
+    """List the keys and values that `edit_text` sets for a camera's intrinsics.
 
     Args:
         camera: its name.
@@ -145,7 +145,7 @@ def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
 
 
 def _end(node: yaml.Node) -> int:
-    """Find where a node's text ends; a block's own mark is after the comments that follow it."""
+    """Find the end of a node's text; a block's own mark is after the comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

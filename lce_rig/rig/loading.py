@@ -127,7 +127,7 @@ def dump_rig(rig: Rig, *, is_whole: bool = True) -> str:
 
 
 def _changed(whole: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
-    """Keep models and what is in `changed`, which has the same blocks."""
+    """Keep the models, and the keys that are in `changed`, which has the same blocks."""
     return {
         key: _changed(value, changed[key]) if isinstance(value, dict) and key in changed else value
         for key, value in whole.items()
@@ -144,7 +144,7 @@ class _Dumper(yaml.SafeDumper):
     """Write block style, but lists of numbers or names on one line, and floats that read back as floats."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write in full what occurs twice."""
+        """Return True: repeated values are written in full, without YAML aliases."""
         return True
 
     def represent_sequence(
@@ -216,7 +216,7 @@ def read_document(
     Args:
         text: the YAML.
         source: name of the text in errors, usually its file.
-        kind: of file, for the error of a text that is no mapping.
+        kind: of file, for the error of a text that is not a mapping.
         hint: of that error.
 
     Raises:
@@ -274,7 +274,7 @@ def explain(error: ValidationError, document: Document, schema: type[BaseModel] 
 
 
 def _problem(detail: ErrorDetails, schema: type[BaseModel]) -> tuple[KeyPath, str, KeyPath | None]:
-    """Give a problem's key, its words, and the valid key that an unknown one probably stands for."""
+    """Return a problem's key, its text, and the valid key that an unknown one probably stands for."""
     path = tuple(part for part in detail["loc"] if part != "[key]")
     kind, context = detail["type"], detail.get("ctx", {})
     # Bounded: repr() would write nested aliases out.

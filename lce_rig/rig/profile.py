@@ -52,7 +52,7 @@ OutputFormat = Literal[
 
 
 def _isaac_is_urdf(formats: Any) -> Any:
-    """Put the URDF in place of `isaac`, its other name in earlier versions."""
+    """Replace `isaac`, an earlier version's name, by the URDF format."""
     if not isinstance(formats, list | tuple) or "isaac" not in formats:
         return formats
     others = [name for name in formats if name != "isaac"]
@@ -332,10 +332,10 @@ class Rig(Settings):
         return self
 
     def of_robot(self, name: str | None) -> "Rig":
-        """Name the robot that carries this very rig; None leaves it as it is.
+        """Return the rig with the name of the robot that carries it; None changes nothing.
 
         Raises:
-            UsageError: the profile names another one, or it cannot be a name.
+            UsageError: the profile names another robot, or the name is invalid.
         """
         if name is None or name == self.robot:
             return self

@@ -129,21 +129,21 @@ class LidarIntrinsicsSettings(Settings):
 
 
 class LidarSettings(Settings):
-    """One LiDAR; where the profile is silent, the figures are those of the model's data sheet.
+    """One LiDAR; figures that the profile omits are those of the model's data sheet.
 
     Attributes:
         model: maker's name of the model, or "other".
-        serial: serial number of this very unit, if the device does not tell it.
+        serial: serial number of this very unit, for devices that do not report it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
         rate_hz: of its scans. Without rings, scans that come faster are accumulated to this rate.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
-        elevations_deg: of the rings, lowest first, where they differ from the model's.
-        columns: firings of each ring per revolution, where they differ from the model's.
-        beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
+        elevations_deg: of the rings, lowest first; None for the model's.
+        columns: firings of each ring per revolution; None for the model's.
+        beam_aperture_m: width of the light beam at the sensor's exit; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
-        range_offset_m: by how much the driver's ranges are too long, all alike; subtracted first.
+        range_offset_m: constant excess of the driver's ranges, the same for all; subtracted first.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
         range_offset_sigma_m: standard deviation of that mean, the error common to all ranges left after
             `range_offset_m`.
@@ -188,7 +188,7 @@ class LidarSettings(Settings):
         } | values
 
     def data_sheet(self) -> DataSheet | None:
-        """Give the model's data sheet, with the profile's own beams; None where beams are not known."""
+        """Return the model's data sheet, with the profile's own beams; None if the beams are unknown."""
         sheet = find_data_sheet(self.model)
         if sheet is None and self.elevations_deg is None:
             return None
@@ -224,7 +224,7 @@ class IntrinsicsSettings(Settings):
     Attributes:
         model: radtan (OpenCV's and ROS's plumb_bob) or equidistant (OpenCV's fisheye).
         distortion: radtan k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant k1 k2 k3 k4.
-        focal_sigma_px: standard deviation of both focal lengths alike; by default 0.25 % of `fx_px`.
+        focal_sigma_px: common standard deviation of both focal lengths; by default 0.25 % of `fx_px`.
         principal_point_sigma_px: standard deviation of `cx_px` and of `cy_px`; by default 0.4 % of `fx_px`.
         distortion_sigma_px: standard deviation of a pixel's displacement in the image's corner by errors of
             the distortion; by default 0.25 % of `fx_px`.
@@ -272,7 +272,7 @@ class CameraSettings(Settings):
 
     Attributes:
         model: maker's name of the model.
-        serial: serial number of this very unit, if the device does not tell it.
+        serial: serial number of this very unit, for devices that do not report it.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
         resolution_px: (width, height) of the images.
@@ -315,7 +315,7 @@ class CameraSettings(Settings):
         return self
 
     def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
-        """Name the first channel of a kind; None if there is none."""
+        """Return the first channel of a kind, or None."""
         return next((name for name, channel in self.channels.items() if channel.kind == kind), None)
 
     def with_intrinsics(self, lens: Intrinsics) -> "CameraSettings":

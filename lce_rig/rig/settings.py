@@ -67,7 +67,7 @@ def problem(what: str, key: str = "") -> PydanticCustomError:
     """Build the error of a check across several keys.
 
     Args:
-        what: what is wrong, with its figures.
+        what: the fault, with its figures.
         key: the key at fault, relative to the block that is checked; empty for the block itself.
     """
     return PydanticCustomError("profile", "{what}", {"what": what, "key": key})

@@ -1,4 +1,4 @@
-"""Pages and their drawings: files that load nothing, with everything escaped that is put into them."""
+"""Pages and their drawings: self-contained files in which all inserted text is escaped."""
 
 import re
 from functools import cache
@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 @cache
 def environment() -> Environment:
-    """Give the templates: everything that is put into them is escaped, and nothing may be missing."""
+    """Return the templates: inserted text is escaped, and a missing value is an error."""
     made = Environment(
         loader=PackageLoader("lce_rig.show.report"),
         autoescape=True,
@@ -74,7 +74,7 @@ _STYLE: Any = {
     "axes.labelcolor": QUIET,
     "axes.titlelocation": "left",
     "axes.titlecolor": INK,
-    # Else Matplotlib measures all texts to place a title above them.
+    # Otherwise Matplotlib measures all texts to place a title above them.
     "axes.titley": 1.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -90,7 +90,7 @@ _STYLE: Any = {
 
 
 def style(part: str = "") -> Any:
-    """Give the context in which figures of a part of a page are made and drawn."""
+    """Return the context in which figures of a part of a page are made and drawn."""
     from matplotlib import rc_context
 
     return rc_context(_STYLE | {"svg.hashsalt": part})

@@ -44,13 +44,13 @@ def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster
             is_hidden = occluders.is_blocked(points[lit] + 2e-3 * normals[lit], lamp - [0.0, 0.0, 0.06])
             share[lit[is_hidden]] *= 0.15
         of_lamps += share
-    # What looks up gets a little more of the soft light.
+    # Surfaces that face up get a little more of the soft light.
     soft = (0.85 + 0.15 * normals[:, 2:]) * _AMBIENT
     return np.asarray(soft + of_lamps[:, None] * _LAMP)
 
 
 def reached(origins: Array, directions: Array, hits: Hits) -> Array:
-    """Compute the points (N, 3) that rays reach; their origins where they meet nothing."""
+    """Compute the points (N, 3) that rays reach; a ray without a hit returns its origin."""
     return np.asarray(origins + np.where(np.isfinite(hits.range_m), hits.range_m, 0.0)[:, None] * directions)
 
 
@@ -184,9 +184,9 @@ def beside_changes(changes_down: NDArray[np.bool_], changes_across: NDArray[np.b
 
 
 def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Array]:
-    """Compute what rays (N, 3) see of the standing room: linear (N, 3), and how far away that is (N,), m.
+    """Compute the radiance, linear (N, 3), and range (N,), m, that rays (N, 3) see of the standing room.
 
-    It is done in pieces that fit the cache and the memory.
+    Pieces that fit the cache and the memory are rendered one after the other.
     """
     surfaces = room.raycaster.surfaces
     pieces = []

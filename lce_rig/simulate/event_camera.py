@@ -109,7 +109,7 @@ class EventCamera:
         return np.asarray(seen, dtype=np.float64)
 
     def see(self, radiance: NDArray[np.float32], t_ns: int) -> None:
-        """Let ln(intensity) run in a straight line from what was seen last to `radiance` (H, W) at t_ns."""
+        """Ramp ln(intensity) linearly from the previous image to `radiance` (H, W) at t_ns."""
         now_s, start_s = 1e-9 * (t_ns - self._start_ns), self._now_s
         seen = self._log(radiance)
         # A ramp passes each pixel's low-pass exactly: y' = (x - y) / tau with x = x0 + k t has the solution
@@ -123,12 +123,13 @@ class EventCamera:
             decay = np.exp(-(now_s - start_s) / tau_s)
             output = np.asarray(seen - lag + (self._output - self._input + lag) * decay)
         leak_per_s = self._noise.leak_hz * self._pixels.threshold_on
-        # What the pixel compares, at the start of the step, and how fast it grows: e(t) = excess + slope t.
+        # The difference that the pixel compares, at the start of the step, and its slope:
+        # e(t) = excess + slope t.
         excess = self._output - self._reference
         slope = (output - self._output) / (now_s - start_s) + leak_per_s
         begin_s = self._released_s - start_s
         is_waking = begin_s > 0
-        # A pixel compares against what it sees at the moment it is released from its refractory period.
+        # A pixel's reference is its signal at the moment it is released from its refractory period.
         excess = np.where(is_waking, -slope * begin_s, excess)
         end_excess = excess + slope * (now_s - start_s)
         is_blind = begin_s > now_s - start_s

@@ -24,7 +24,7 @@ _GAMMA = 1 / 2.2
 
 
 def render_radiance(scene: Scene, backdrop: Backdrop, *, is_draft: bool = False) -> Array:
-    """Compute what reaches the lens: linear (H, W, 3), anti-aliased where an edge of board or carrier runs.
+    """Compute the light at the lens: linear (H, W, 3), anti-aliased along edges of board and carrier.
 
     Args:
         scene: the room of the backdrop, with the board and its carrier.
@@ -85,7 +85,7 @@ class _ImageWindow(NamedTuple):
 def _look_through_centres(
     scene: Scene, backdrop: Backdrop, window: _ImageWindow, occluders: Raycaster | None
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Cast one ray a pixel: label (h, w) of what is seen, -1 the backdrop; its colour and light (h, w, 3)."""
+    """Cast one ray per pixel: label (h, w) of its surface, -1 the backdrop; its colour, light (h, w, 3)."""
     shape = window.backdrop.shape
     rays = pixel_rays(window.corner_rays).reshape(-1, 3)
     hits = scene.cast_moving(backdrop.origin, rays)
@@ -109,7 +109,7 @@ def _look_through(
     pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
     rays: Array,
 ) -> Array:
-    """Average what n rays (M, n, 3) a pixel see: (M, 3), with the light on carrier and board there."""
+    """Average n rays (M, n, 3) per pixel: (M, 3), with the light on carrier and board from `lights`."""
     v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
     flat = rays.reshape(-1, 3)
     hits = scene.cast_moving(origin, flat)
@@ -146,7 +146,7 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
 
 @lru_cache(maxsize=8)
 def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
-    """Compute by what radiance is multiplied on its way to each pixel (H, W): vignetting.
+    """Compute the factor on each pixel's radiance (H, W): vignetting.
 
     It is the same for all images of a camera and read-only.
     """

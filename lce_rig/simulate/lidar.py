@@ -19,10 +19,10 @@ class Returns:
     """The returns of beams.
 
     Attributes:
-        range_m: (N,), inf where nothing.
+        range_m: (N,), inf for no return.
         energy: (N,) received, 1 for a white surface across the whole beam.
         reflectivity: (N,) of the surface hit, 0..1.
-        surface: (N,) int32 index of the scene's surface, -1 where nothing.
+        surface: (N,) int32 index of the scene's surface, -1 for no return.
     """
 
     range_m: Array
@@ -32,7 +32,7 @@ class Returns:
 
 
 def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Find the return of each beam: its axis alone decides where its whole footprint hits one surface.
+    """Find the return of each beam; only a beam whose footprint may touch several surfaces is split.
 
     Args:
         scene: the surfaces.
@@ -116,7 +116,7 @@ def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> 
         summed = np.bincount(group.ravel(), weights=values.ravel(), minlength=n * k)
         return np.asarray(summed, dtype=np.float64).reshape(n, k)
 
-    # What reaches the receiver falls with the square of the range; the reported intensity does not.
+    # The received power falls with the square of the range; the reported intensity does not.
     power = total(energy / np.maximum(safe_range, 0.1) ** 2)
     best = np.argmax(power, axis=1)
     rows = np.arange(n)
@@ -139,12 +139,12 @@ _THRESHOLD = 0.04
 #: ... up to this range; beyond it the threshold grows with the square of the range.
 _FULL_RANGE_M = 30.0
 _AZIMUTH_STEP_RAD = np.radians(0.01)
-# A board at 0.3 m/s is seen within 0.14 mm of where it is. The time is that of 16 sequences of a VLP-16; in
-# fewer firings than 256 nothing is gained.
+# Stretch of firings with one pose of a moving board: the duration of 16 sequences of a VLP-16, ns (a board at
+# 0.3 m/s is seen within 0.14 mm of its place), and at least 256 firings, as shorter stretches gain nothing.
 _INSTANT_NS, _FIRINGS_PER_INSTANT = 884_736, 256
 
 
-# Of a rosette's two prisms, for all of its lines, and of the Mid-360's rotor and mirror, Hz; no multiples.
+# Rotation rates, Hz, not multiples: a rosette's two prisms, for all its lines; a Mid-360's rotor and mirror.
 _PRISMS_HZ, _MID360_HZ = (1213.7, -771.3), (10.37, 2311.7)
 _LINES = 4  # of a Mid-360: beams side by side in elevation
 _LINE_RAD = np.radians(0.7)
@@ -172,7 +172,7 @@ def _pattern(sheet: DataSheet, starts_ns: NDArray[np.int64]) -> tuple[Array, Arr
 class LidarModel:
     """The geometry and timing of a LiDAR at one rate.
 
-    Of one without rings, each firing of a scan is a laser of its own.
+    For a LiDAR without rings, each firing of a scan is a laser of its own.
 
     Attributes:
         name: of the model.
@@ -262,7 +262,7 @@ def sweep_scene(
     """Send the beams of one revolution.
 
     Args:
-        scene: what the beams meet.
+        scene: the surfaces that the beams meet.
         T_world_lidar: (4, 4).
         model: the LiDAR's geometry and timing.
         noise: its errors.
@@ -349,7 +349,7 @@ def measure_sweep(
 def _beams(
     model: LidarModel, T_world_lidar: Array, laser: NDArray[np.intp], azimuth_rad: Array
 ) -> tuple[Array, Array]:
-    """Find where beams (N,) begin and where they go, (N, 3) each, world; of one pose, or one each."""
+    """Compute the origins and directions of beams (N,), (N, 3) each, world; of one pose, or one each."""
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
     if model.origin_radius_m:

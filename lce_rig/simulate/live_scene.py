@@ -22,13 +22,13 @@ _NOISE_STREAM = 102
 class LiveScene:
     """Renders images and scans of a moving board.
 
-    Of a board that is held, images are rendered and beams are traced once; each image and scan has its own
+    For a held board, images are rendered and beams are traced once; each image and scan has its own
     noise. On its way, when nothing is captured, both are drafts: images without shadows and anti-aliasing,
     infinitely thin beams.
 
     Attributes:
         stage: the simulated rig and its room.
-        T_world_board: (4, 4) where the board is.
+        T_world_board: (4, 4) present pose of the board.
     """
 
     def __init__(self, rig: Rig, seed: int, options: SimulationOptions) -> None:

@@ -33,7 +33,7 @@ class LidarNoise:
         edge_growth_m: how much wider the beam's rim is than divergence and exit explain; with it the returns
             reach 9-10 mm beyond a board's border, as they do on real recordings.
         divergence_rad: full opening of the beam, horizontal and vertical.
-        exit_size_m: size of the beam where it leaves the sensor, horizontal and vertical.
+        exit_size_m: size of the beam at the sensor's exit, horizontal and vertical.
         dropout: probability that a return is lost.
         range_step_m: resolution of ranges.
         is_quantised: whether ranges come in such steps and azimuths in steps of 0.01 deg.
@@ -54,7 +54,7 @@ class LidarNoise:
 
     @classmethod
     def of(cls, sheet: DataSheet) -> "LidarNoise":
-        """Take the errors from a data sheet; how ranges depend on brightness is a VLP-16's for all models."""
+        """Read the errors from a data sheet; the range error by brightness is a VLP-16's for all models."""
         return cls(
             range_sigma_m=sheet.range_sigma_m,
             laser_sigma_m=sheet.laser_bias_sigma_m,
@@ -150,25 +150,25 @@ class SimulationOptions:
     """The content of a simulated session and the errors of its sensors.
 
     Attributes:
-        carrier: what carries the board.
+        carrier: support of the board: a stand, a person or none.
         lidar: errors of all LiDARs; None for those of each one's data sheet.
         camera: the cameras' errors.
-        distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
-            fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
+        distance_m: range of the board's distance from the camera; no board is placed where the LiDAR would
+            see less than four fifths of the plate (a diamond of 1 m nearer than about 1.4 m).
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
-        truth_rotation_deg, truth_translation_m: how far the true extrinsics lie from the profile's nominal
-            ones at most; never more than 0.8 of the tolerances that the profile gives.
+        truth_rotation_deg, truth_translation_m: maximum distance of the true extrinsics from the profile's
+            nominal ones; never more than 0.8 of the profile's tolerances.
         mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
         motion: whether the board is held still or moved by hand; only a moving one makes events.
-        hand: how it moves.
+        hand: its movement.
         events: errors of cameras with a channel of events; their optics are `camera`'s.
-        events_span_s: how long before and after a scan's timestamp a capture's events begin and end.
+        events_span_s: time that a capture's events cover before and after a scan's timestamp.
         exposure_s: of a moving board's images.
         frame_every_s: between the images of a camera that runs freely while the board moves.
-        frame_offset_s, event_offset_s: how far the timestamps of images and of events are ahead of the
-            LiDAR's clock, which is the rig's.
+        frame_offset_s, event_offset_s: lead of the timestamps of images and of events over the LiDAR's clock,
+            which is the rig's.
     """
 
     carrier: Carrier = "stand"
@@ -195,7 +195,7 @@ class SimulationOptions:
 
     @classmethod
     def for_rig(cls, name: str, motion: Motion = "still") -> "SimulationOptions":
-        """Choose what the recordings of the rig of this name show, of a board held still or moving."""
+        """Choose the content of recordings of the rig of this name, with a board held still or moving."""
         if name.startswith("sss"):
             # The paper's simulated rig: a board hung in the air, and exactly known extrinsics.
             return cls(carrier="none", motion=motion, truth_rotation_deg=0.0, truth_translation_m=0.0)

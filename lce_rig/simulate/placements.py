@@ -87,7 +87,7 @@ class CameraView:
     def count_rings(self, board: Board, T_world_board: Array) -> int:
         """Count the LiDAR's rings with at least a few returns from the board.
 
-        Without rings, a board that lies in the field of view, with a margin, counts as one with enough.
+        Without rings, a board in the field of view, with a margin, counts as one with enough.
         """
         if self.model.pattern != "rings":
             return _WANTED_RINGS if self._is_in_view(board, T_world_board) else 0
@@ -138,8 +138,8 @@ def place_board(
         room: the board and its carrier must stand free in it.
         options: ranges of distance and roll.
         index: of the capture; consecutive ones fill the image evenly.
-        rng: source of the tilt and of what is tried next.
-        start: (3,) where the session's even filling begins, 0..1.
+        rng: source of the tilt and of the next candidates.
+        start: (3,) start of the session's even filling, 0..1.
 
     Raises:
         LceRigError: no placement is visible to both the camera and the LiDAR.
@@ -174,7 +174,7 @@ def place_board(
 def _candidate(
     view: CameraView, options: SimulationOptions, where: Array, rng: np.random.Generator
 ) -> Array | None:
-    """Put the board's centre at a place in the image and turn it about facing the camera."""
+    """Place the board's centre in the image and rotate it about facing the camera."""
     # Evenly over the disc of all tilts: strong tilts constrain the extrinsics most.
     tilt_rad = np.radians(_TILT_DEG) * np.sqrt(rng.uniform())
     direction_rad = rng.uniform(0.0, 2 * np.pi)
@@ -282,7 +282,7 @@ def hold_board(T_world_board: Array) -> Trajectory:
 def sway_board(
     T_world_board: Array, anchor_ns: int, hand: HandMotion, rng: np.random.Generator
 ) -> Trajectory:
-    """Let a hand move the board about and through T_world_board (4, 4), where it is at anchor_ns exactly."""
+    """Simulate a hand that moves the board about and through T_world_board (4, 4), the pose at anchor_ns."""
     speed_mps = rng.uniform(*hand.speed_mps)
     frequency_hz, amplitude, phase_rad = _draw_sways(T_world_board, speed_mps, hand, rng)
     anchor = np.array([anchor_ns], dtype=np.int64)
@@ -293,7 +293,7 @@ def sway_board(
 def carry_board(
     placements: Sequence[Array], start_ns: int, hand: HandMotion, rng: np.random.Generator
 ) -> Trajectory:
-    """Let a hand carry the board from placement to placement (each (4, 4)), resting at each for a while.
+    """Simulate a hand that carries the board from placement to placement (each (4, 4)), resting at each.
 
     While it rests, it sways at a quarter of the greatest speed.
     """

@@ -28,7 +28,7 @@ LIDAR_HEIGHT_M = 1.0
 # Room frame: x along the first camera's sight, y left, z up, origin on the floor below the LiDAR.
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
-# (low, high) of what stands in the room, to keep the board out of it
+# (low, high) of objects in the room, to keep the board out of them, m, frame room.
 _OBSTACLES: Obstacles = (
     (np.array([4.9, 1.2, 0.0]), np.array([5.5, 1.8, 3.1])),
     (np.array([4.6, -3.1, 0.0]), np.array([6.3, -2.0, 1.3])),
@@ -46,7 +46,7 @@ class Room:
         raycaster: of all surfaces.
         lamps: (P, 3) m, world.
         low, high: (3,) corners, m, frame room.
-        obstacles: (low, high) of what stands in it, m, frame room.
+        obstacles: (low, high) of objects in it, m, frame room.
     """
 
     T_world_room: Array
@@ -70,7 +70,7 @@ def build_room(heading_rad: float, rng: np.random.Generator, furnish: Furnish | 
 
     Args:
         heading_rad: azimuth that the first camera looks along, world.
-        rng: source of the room's turn against the rig, and of what is drawn in it.
+        rng: source of the room's rotation against the rig, and of its furniture.
         furnish: draws corners (3,), parts and obstacles of a room from those of the usual one; None keeps it.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
@@ -165,7 +165,7 @@ SHIRTS = (
 def build_carrier(
     carrier: Carrier, board: Board, T_world_board: Array, rng: np.random.Generator
 ) -> list[Surface]:
-    """Build what carries the board at T_world_board (4, 4), standing on the floor z = 0 behind it."""
+    """Build the board's carrier for T_world_board (4, 4), standing on the floor z = 0 behind the board."""
     if carrier == "stand":
         return _stand(board, T_world_board)
     if carrier == "person":

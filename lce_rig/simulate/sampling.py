@@ -54,8 +54,8 @@ class StagedBoard:
 
     Attributes:
         stage: the session.
-        trajectory: where the board is.
-        carrier_rng: source of what its carrier looks like; it is copied, so that the carrier stays the same.
+        trajectory: poses of the board over time.
+        carrier_rng: source of the carrier's appearance; it is copied, so that the carrier stays the same.
     """
 
     stage: Stage
@@ -76,7 +76,7 @@ class StagedBoard:
         return Scene(stage.room.raycaster, carrier, stage.board, T_world_board)
 
     def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
-        """Expose an image about a time: the mean of what is seen while the shutter is open."""
+        """Expose an image about a time: the mean of the views while the shutter is open."""
         stage, options = self.stage, self.stage.options
         backdrop = stage.backdrops[camera]
         smear_px = options.exposure_s * speed_px_s(self.trajectory, stage.board, backdrop, exposed_ns)
@@ -92,9 +92,9 @@ class StagedBoard:
         return Image(camera, channel, stamp_ns, expose(radiance, options.camera, rng), stamp_ns)
 
     def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
-        """Take a scan that begins at a time; every firing meets a moving board where it is by then.
+        """Take a scan that begins at a time; every firing meets a moving board at its pose of that moment.
 
-        The carrier stays where it is when the rotor has made half its turn.
+        The carrier stays at its pose of half a revolution.
         """
         stage = self.stage
         T_world_lidar, model, noise = stage.T_world_sensor[lidar], stage.models[lidar], stage.noise[lidar]
@@ -129,7 +129,7 @@ class StagedBoard:
 
 
 def _numbered(stream: Stream, kind: int, sensor: int) -> Stream:
-    """Name the stream of one sensor: (session or capture, kind, sensor, what else there is)."""
+    """Name the stream of one sensor: (session or capture, kind, sensor, any further numbers)."""
     return (stream[0], kind, sensor, *stream[1:])
 
 
@@ -146,7 +146,7 @@ class SimulatedCapture:
             frames, at the timestamp of the scan it was placed for.
         target: the camera and the LiDAR that the board was placed for; others may not see it.
         events: one a camera that has a channel of events, if the board moves.
-        trajectory: where the board is in the world at any time of the rig's clock, the LiDAR's.
+        trajectory: pose of the board in the world at any time of the rig's clock, the LiDAR's.
         T_world_sensor: (4, 4) of each camera and LiDAR.
     """
 
@@ -209,7 +209,7 @@ def capture_at(
         stage: the session, see `set_stage`.
         index: of the capture; its noise and its timestamp follow from it.
         T_world_board: (4, 4).
-        rng: source of what its carrier looks like; follows from the index by default.
+        rng: source of the carrier's appearance; follows from the index by default.
     """
     board = StagedBoard(stage, hold_board(T_world_board), rng or stage.rng(index, CARRIER))
     return _capture(board, index, _middle_ns(stage, index))
@@ -250,13 +250,13 @@ def _capture(board: StagedBoard, index: int, exposed_ns: int) -> SimulatedCaptur
 
 
 def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOptions) -> dict[str, Any]:
-    """Return where the board was when each sensor saw it.
+    """Return the board's true pose at each sensor's time of measurement.
 
     Returns:
         `boards`: by sensor `t_ns`, on the rig's clock, and `T_sensor_board` then; `speed_mps` of the board's
-        middle when the LiDAR that it was placed for met it. A LiDAR's time is the mean firing time of its
-        returns from the board, a camera's the middle of its image's exposure, or that of the LiDAR where it
-        takes none.
+        middle at the time of the LiDAR that it was placed for. A LiDAR's time is the mean firing time of its
+        returns from the board. A camera's is the middle of its image's exposure, or without an image that
+        LiDAR's time.
     """
     times_ns = {scan.sensor: board_time_ns(rig, capture, scan) for scan in capture.scans}
     middle_ns = times_ns[capture.target[1]]
@@ -275,7 +275,7 @@ def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOption
 def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
     """Find the mean firing time of a scan's board returns; half a scan after its timestamp without any.
 
-    Each return is compared with the board where it was at that return's own time.
+    Each return is compared with the board's pose at that return's own time.
     """
     first_ns = scan.stamp_ns or 0
     middle_ns = first_ns + round(0.5e9 / rig.lidars[scan.sensor].rate_hz)
@@ -361,7 +361,7 @@ def simulate_recording(
 
 
 def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
-    """Return where the board is before the first LiDAR, 100 times per second.
+    """Return the board's pose before the first LiDAR, 100 times per second.
 
     Returns:
         `boards`: by LiDAR `t_ns` (K), on the rig's clock, and `T_sensor_board` (K, 4, 4).

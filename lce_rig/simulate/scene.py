@@ -38,9 +38,9 @@ class Hits:
     """The first hits of rays.
 
     Attributes:
-        range_m: (N,) distance along the unit ray; inf where nothing is met.
-        surface: (N,) int32 index, -1 where nothing is met.
-        normals: (N, 3) unit, towards the side the ray comes from; zero where nothing is met.
+        range_m: (N,) distance along the unit ray; inf without a hit.
+        surface: (N,) int32 index, -1 without a hit.
+        normals: (N, 3) unit, towards the side the ray comes from; zero without a hit.
     """
 
     range_m: Array
@@ -140,8 +140,8 @@ class Scene:
     """The scene of one capture.
 
     Args:
-        static: what stands still over a session.
-        moving: what stands elsewhere in each capture: the board's carrier.
+        static: surfaces that stand still over a session.
+        moving: surfaces of the board's carrier, which stand elsewhere in each capture.
         board: the board.
         T_world_board: (4, 4).
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
@@ -178,12 +178,12 @@ class Scene:
         return Raycaster([*self.moving.surfaces, Surface("board", plate, PLATE, self.T_world_board)])
 
     def cast(self, origins: Array, directions: Array, *, with_normals: bool = True) -> Hits:
-        """Find what each ray meets first; the board is met analytically, in float64."""
+        """Find the first hit of each ray; hits of the board are computed analytically, in float64."""
         hits = self.static.cast(origins, directions, with_normals=with_normals)
         return self._nearer(hits, self.cast_moving(origins, directions, with_normals=with_normals))
 
     def cast_moving(self, origins: Array, directions: Array, *, with_normals: bool = True) -> Hits:
-        """Find what each ray meets first of the carrier and the board, ignoring what stands before them."""
+        """Find each ray's first hit of carrier or board, ignoring the static surfaces."""
         hits = self.cast_board(origins, directions)
         if not self.moving.surfaces:
             return hits
@@ -226,7 +226,7 @@ class Scene:
         return np.asarray(normals @ self.T_world_board[:3, 2] > 0)
 
     def reflectivity(self, hits: Hits, points_world: Array) -> Array:
-        """Evaluate the reflectivity (N,) at the LiDAR's wavelength; 0 where nothing is met."""
+        """Evaluate the reflectivity (N,) at the LiDAR's wavelength; 0 without a hit."""
         values = [surface.material.reflectivity for surface in self.surfaces]
         table = np.array([*values, PLATE.reflectivity, 0.0])
         out = np.asarray(table[hits.surface], dtype=np.float64)
@@ -238,7 +238,7 @@ class Scene:
         return out
 
     def colour(self, hits: Hits, points_world: Array) -> Array:
-        """Evaluate the linear albedo (N, 3); 0 where nothing is met."""
+        """Evaluate the linear albedo (N, 3); 0 without a hit."""
         out = np.zeros((len(points_world), 3))
         for index in np.unique(hits.surface):
             rows = np.flatnonzero(hits.surface == index)

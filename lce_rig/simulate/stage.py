@@ -29,7 +29,7 @@ TRUTH, ROOM, LASERS, START, PLACEMENT, SCAN, IMAGE, PIXELS, HAND, CARRIER, PHASE
 _FORWARD = pose(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
 )
-# What is placed for a rig without cameras lies in the view of this lens, ahead of its first LiDAR.
+# View, ahead of its first LiDAR, in which boards of a rig without cameras are placed.
 _WINDOW = Intrinsics(600.0, 600.0, 640.0, 360.0, 1280, 720)
 
 
@@ -40,11 +40,11 @@ class Stage:
     Attributes:
         rig: the profile.
         seed: of the session.
-        options: what it shows.
+        options: content and errors of the session.
         board: the profile's board.
-        room: where all of it stands.
+        room: the static objects around them.
         T_world_sensor: (4, 4) of each camera and LiDAR.
-        backdrops: what each simulated camera sees of the room.
+        backdrops: each simulated camera's image of the room.
         models: of each LiDAR.
         noise: its errors.
         laser_bias_m: (L,) range offset of each laser of each LiDAR.
@@ -75,7 +75,7 @@ class Stage:
         return np.random.default_rng([self.seed, *stream])
 
     def measure(self, lidar: str, sweep: Sweep, rng: np.random.Generator, stamp_ns: int) -> Scan:
-        """Measure what the beams of a LiDAR hit, with its own errors."""
+        """Measure the hits of a LiDAR's beams, with its own errors."""
         settings, noise = self.rig.lidars[lidar], self.noise[lidar]
         return measure_sweep(
             sweep,

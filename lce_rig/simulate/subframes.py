@@ -37,7 +37,7 @@ class MovingView:
     Attributes:
         backdrop: the camera and the standing room.
         board: the board.
-        trajectory: where it is.
+        trajectory: poses of the board over time.
         lens: the camera's errors; blur and vignetting count.
     """
 
@@ -100,11 +100,11 @@ class MovingView:
         return np.nan_to_num(shade.astype(np.float32)), np.nan_to_num(cover)
 
     def _print(self, x: Float, y: Float, spread_x: Float, spread_y: Float) -> Float:
-        """Compute the share (h, w) of each pixel that is inked.
+        """Compute the inked share (h, w) of each pixel.
 
-        Along each axis the squares are a wave of +-1, smoothed where it changes sign; where both waves have
-        the same sign the pattern is dark. For a smoothing that is round in the image this product is what
-        smoothing the whole pattern would give, as long as the board is not seen at a grazing angle.
+        Along each axis the squares are a wave of +-1, smoothed at its sign changes; the pattern is dark where
+        both waves have the same sign. For a smoothing that is round in the image, their product equals the
+        smoothed pattern, unless the board is seen at a grazing angle.
         """
         board, offset_m = self.board, self.board.pattern_offset_m
         if board.has_markers:
@@ -149,7 +149,7 @@ def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: i
 
 
 def _window(points: Array, backdrop: Backdrop) -> Window | None:
-    """Bound the pixels of points (N, 3), world, with a margin; None where the image shows none."""
+    """Bound the pixels of points (N, 3), world, with a margin; None if they are outside the image."""
     pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), points))
     if not is_valid.any():
         return None

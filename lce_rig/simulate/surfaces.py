@@ -19,7 +19,7 @@ class Material:
     Attributes:
         colour: linear (blue, green, red) albedo, 0..1.
         reflectivity: at the LiDAR's 905 nm, 0..1; 0 gives no return (glass).
-        pattern: what is printed on it.
+        pattern: texture on the surface.
         emission: linear radiance of its own, in units of the albedo.
     """
 
@@ -120,7 +120,7 @@ class Mesh:
     triangles: NDArray[np.uint32]
 
     def moved(self, T_a_b: Array) -> "Mesh":
-        """Take the mesh from frame b to frame a."""
+        """Transform the mesh from frame b to frame a."""
         return Mesh(transform(T_a_b, self.vertices), self.normals @ T_a_b[:3, :3].T, self.triangles)
 
 

@@ -32,7 +32,7 @@ from lce_rig.rig import QualitySettings
 #: Events older than this no longer show in the network's image.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
-# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
+# Share of a DAVIS346's image taken by a board of 0.8 x 0.6 m at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
 # Poses nearer in time than this do not determine a speed.
@@ -73,10 +73,10 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
 
 
 def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
-    """Measure how long a LiDAR takes from its first to its last return from the board.
+    """Measure the time from a LiDAR's first to its last return from the board, s.
 
     Args:
-        lidar: the board in one scan; without firing times the azimuth it spans tells.
+        lidar: the board in one scan; without firing times, its span in azimuth is used.
         period_s: of one revolution.
     """
     if lidar.offset_ns is not None and len(lidar.offset_ns):
@@ -106,7 +106,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
         return measured
     since_s = time_s - time_s.mean()
     share = since_s / np.sum(since_s**2)
-    # By time, of the pose's tangent: translation in m, rotation in rad.
+    # Velocity of the pose's tangent: translation in m/s, rotation in rad/s.
     velocity = share[1:] @ difference(track, found.T_cam_board)
     cov = np.einsum("k,kij->ij", share**2, np.concatenate([found.cov[None], track_cov]))
     speed_mps, speed_sigma_mps = _length(velocity[:3], cov[:3, :3])
@@ -185,12 +185,12 @@ def explain_missing_board(
     limits: QualitySettings,
     frame_speed_mps: float = math.nan,
 ) -> Refusal:
-    """Return the fault of the events that prevents a detection; `seen` if there is none.
+    """Return the fault of the events that prevents a detection, or else `seen`.
 
     Args:
         events: about the image.
         stamp_ns: of the image.
-        seen: why there is no image, or no board in it.
+        seen: the refusal, because the image is missing or has no board in it.
         limits: `quality` of the rig profile.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
     """

@@ -62,7 +62,7 @@ class ReconstructionModel:
         self._multiple = math.lcm(*(divisor for _, divisor in self._states))
 
     def initial_states(self, height_px: int, width_px: int) -> States:
-        """Make the states before the first window for a sensor of this size: zeros."""
+        """Return the states before the first window for a sensor of this size: zeros."""
         height, width = self._padded(height_px), self._padded(width_px)
         return tuple(
             np.zeros((1, n_channels, height // divisor, width // divisor), np.float32)
@@ -121,18 +121,18 @@ class IntensityScale:
 
 
 def _bounds(picture: FloatArray) -> NDArray[np.float64]:
-    # Every fourth pixel in each direction tells the percentiles well enough.
+    # Every fourth pixel in each direction is enough for the percentiles.
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
 
 
-# A window emptier than this is judged together with the one before it: too few events make noise, not edges.
+# Minimum fill of a window judged alone, not with the previous one: too few events make noise, not edges.
 _MIN_FILL = 0.5
 # Nothing happens in a longer silence: it is passed over in one stride, states kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
 # A stream cut off at the timestamp ends with its last event, a little before.
 _MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
-# Steps until the states have settled, on a real DAVIS346 recording.
+# Number of steps until the states have settled, on a real DAVIS346 recording.
 N_WARM_UP = 12
 
 
@@ -149,8 +149,8 @@ class Reconstructor:
     """Runs over one event stream, with a recurrent state for the whole stream.
 
     Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
-    asked for change what the network has seen: an image at a timestamp is a side step from the running state
-    with the events up to the timestamp.
+    asked for change the network's state: an image at a timestamp is a side step from the running state with
+    the events up to the timestamp.
 
     Args:
         channel: the channel of the images.
@@ -203,7 +203,7 @@ class Reconstructor:
                 yield READ_OUTSIDE_EVENTS.refusal(gap_s=1e-9 * late_ns)
 
     def feed(self, events: Events) -> None:
-        """Take the next events of a stream that runs on; `picture_at` gives its images.
+        """Add the next events of a continuing stream; `picture_at` returns its images.
 
         Args:
             events: up to the next timestamp that an image will be asked for, or shorter.
@@ -283,7 +283,7 @@ class Reconstructor:
             self._commit(end_ns)
 
     def _commit(self, end_ns: int) -> FloatArray:
-        """Close the current window and step; what is left of its events begins the next."""
+        """Close the current window and step; its remaining events begin the next one."""
         assert self._current is not None
         window = self._current
         events = window.events.between(window.start_ns, end_ns)
@@ -302,6 +302,6 @@ class Reconstructor:
     def _picture(
         self, events: Events, start_ns: int, end_ns: int, states: States
     ) -> tuple[FloatArray, States]:
-        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        """Compute the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
         voxels = normalise_voxels(voxel_grid(events, self._model.n_bins, start_ns, end_ns))
         return self._model.step(voxels, states)

@@ -48,9 +48,9 @@ def nearest_pose(
     return T, pose_covariance(T, board.corners()[is_seen], intrinsics, found.sigma_px)
 
 
-#: When the board is looked for besides the main picture, ns after it.
+#: Times after the main image of the additional images in which the board is searched, ns.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
-# Between neighbouring images no hand turns the board by more: it is another board, or misread.
+# Maximum rotation by hand between neighbouring images; beyond, it is another board, or misread.
 _MAX_TURN_RAD = np.radians(45)
 
 
@@ -65,7 +65,7 @@ def find_event_board(
     sweep_s: float | None = None,
     frame_speed_mps: float = math.nan,
 ) -> tuple[Image | Refusal, ImageBoard | Refusal]:
-    """Make an image of the events up to a timestamp, find the board in it and follow it to either side.
+    """Reconstruct an image from the events up to a timestamp, find the board and follow it to either side.
 
     Args:
         events: from long enough before the timestamp for the network to settle.

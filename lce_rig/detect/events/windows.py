@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events
 
-# What the network was trained on, and E2VID's habit: about 0.35 events per pixel a step.
+# Events per pixel and step: the network's training value, and E2VID's usual one.
 _EVENTS_PER_PIXEL = 0.35
 BLOCK_PX = 16
-# Share of the sensor that takes part in a usual scene with the camera moving; see `active_share`.
+# Share of active pixel blocks in a typical scene with the camera moving; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
 _LONGEST_NS = 60_000_000
@@ -30,11 +30,11 @@ class WindowRule(NamedTuple):
         return cls(max(1, round(_EVENTS_PER_PIXEL * n_pixels * relative)))
 
     def fill(self, n_events: int, age_ns: int) -> float:
-        """Return how full a window is, 1 where it ends."""
+        """Return how full a window is; 1 closes it."""
         return max(min(n_events / self.n_events, age_ns / _SHORTEST_NS), age_ns / _LONGEST_NS)
 
     def end(self, events: Events, start_ns: int) -> int | None:
-        """Find where the window ends that began at start_ns with the first of `events`, ns; None if not yet.
+        """Find the end of the window that began at start_ns with the first of `events`, ns; None if open.
 
         The window is [start, end): the event that completes the count still belongs to it.
         """
@@ -49,10 +49,10 @@ class WindowRule(NamedTuple):
 
 
 def active_share(events: Events) -> float:
-    """Measure what share of the sensor the events come from: (sum n)^2 / (B sum n^2) over B blocks.
+    """Measure the share of the sensor that the events cover: (sum n)^2 / (B sum n^2) over B blocks.
 
-    The participation ratio does not depend on how many events there are, only on how they are spread; with it
-    a small board before a still background gets windows of the same few pixels of motion as a full image.
+    The participation ratio depends only on the spread of the events, not on their number; with it a small
+    board before a still background gets windows of the same few pixels of motion as a full image.
     """
     if not len(events):
         return 1.0
@@ -124,7 +124,7 @@ def normalise_voxels(voxels: FloatArray) -> FloatArray:
     return voxels
 
 
-# A pixel is hot where it fires this many times as often as the 5 x 5 pixels around it.
+# Ratio of a hot pixel's event count to the median of the 5 x 5 pixels around it.
 _HOT_FACTOR = 8.0
 _HOT_MIN_EVENTS = 20
 _HOT_PERIOD_NS = 500_000_000
@@ -176,9 +176,9 @@ def hot_pixels(n_events: NDArray[np.int64]) -> NDArray[np.bool_]:
 def without_background_activity(events: Events) -> Events:
     """Remove events without a neighbouring event.
 
-    Time is cut into slices of 10 ms; an event stays where its 3 x 3 neighbourhood holds another
-    pixel's event in the same slice, the one before or the one after: the nearest-neighbour filter of [1] with
-    slices in place of a map of timestamps.
+    Time is cut into slices of 10 ms. An event stays if its 3 x 3 neighbourhood holds another pixel's event in
+    the same slice, the one before or the one after: the nearest-neighbour filter of [1] with slices in place
+    of a map of timestamps.
 
     References:
         [1] Delbruck, Frame-free dynamic digital vision, ISSE 2008.
@@ -203,15 +203,15 @@ def without_background_activity(events: Events) -> Events:
 
 
 _BIN_NS = 1_000_000
-# Of recordings under mains lamps 0.83 to 0.86, of others 0.11 to 0.28.
+# Limit of coherence: recordings under mains lamps have 0.83 to 0.86, others 0.11 to 0.28.
 _FLICKER_COHERENCE = 0.5
 
 
 def is_flickering(events: Events) -> bool:
-    """Return whether lamps that flicker, or a light that was switched, made most events of about a second.
+    """Return whether flickering lamps, or a light switched on or off, made most events of about a second.
 
     All pixels that see such light turn brighter together, then darker; moving edges make both at any time.
-    The mean product of the polarities of two events of one millisecond, as a root, tells the two apart.
+    The root mean product of the polarities of two events of one millisecond separates the two.
     """
     if len(events) < 2:
         return False

@@ -18,12 +18,12 @@ Grey = NDArray[np.uint8]
 _WIDE_PX = 700
 _SEARCH_PX = 640
 _MOST_SCALE = 1.5
-# Saddle points that are looked at, and about how far edges reach around them, in the image that is searched.
+# Number of saddle points examined, and approximate reach of their edges, px of the searched image.
 _MOST_SADDLES = 220
 _SADDLE_SIGMA_PX = 1.2
-# Cosine of the angle between a corner's edge and the way to its neighbour, at least.
+# Minimum cosine of the angle between a corner's edge and the direction to its neighbour.
 _ALONG = 0.94
-# Neighbours are alike: in the strength of their saddles, and in how far apart they are along a row.
+# Maximum ratios between neighbours: strength of their saddles, spacing along a row.
 _MOST_STRONGER = 2.5
 _MOST_LONGER = 1.7
 _WAYS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -35,11 +35,11 @@ def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossing
 
     Args:
         grey: (H, W).
-        board: tells the number of inner corners.
-        is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
+        board: with the number of inner corners.
+        is_thorough: whether to go on after the quick attempts, which take a tenth of the total time.
 
     Returns:
-        The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds that many.
+        The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds all of them.
     """
     width = grey.shape[1]
     scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
@@ -77,15 +77,15 @@ def seen_grid(grey: Grey) -> Array | None:
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
-    """Sort a grid of corners as `Board.corners()` does, row by row from the pattern's top left.
+    """Sort a grid of corners into the order of `Board.corners()`, row by row from the pattern's top left.
 
-    A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
-    turns from rows to columns clockwise in the image (v points down) is the one that is not mirrored. Where
-    the pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where
-    it is, the order with its top row up in the image is taken.
+    A finder may start at any of the grid's ends. A camera looks at the front of the pattern, so the order
+    that turns from rows to columns clockwise in the image (v points down) is the one that is not mirrored.
+    For a pattern that is not symmetric under 180 deg, the outer square at the top left is black by
+    convention; for a symmetric one, the order with its top row up in the image is used.
 
     Args:
-        grey: (H, W) the image, whose squares tell black from white.
+        grey: (H, W) the image, for the colours of the squares.
         corners_px: (rows * cols, 2) row by row in any direction.
         board: the board.
     """
@@ -157,7 +157,7 @@ def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -
 
 
 def resize(grey: Grey, scale: float) -> Grey:
-    """Scale an image; cubic where it grows, by areas where it shrinks."""
+    """Scale an image: cubic to enlarge it, by areas to shrink it."""
     if scale == 1.0:
         return grey
     how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
@@ -165,17 +165,17 @@ def resize(grey: Grey, scale: float) -> Grey:
 
 
 def to_full_scale(corners: NDArray[Any], scale: float) -> Array:
-    """Take corners of an image at a scale to (N, 2) px of the whole one."""
+    """Convert corners of a scaled image to (N, 2) px of the full one."""
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
 
 
 def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
-    """Find a grid of just so many crossings by linking saddle points of the grey values.
+    """Find a grid of exactly the given size by linking saddle points of the grey values.
 
-    Each saddle point's two edges point at its neighbours, whose colours are the other way round. Points that
-    find each other so are linked, and the links are followed over the grid. It gives up, and the finders
-    take over, where a corner is missing, or one is linked that does not belong there.
+    Each saddle point's two edges point at its neighbours, whose colours are inverted. Points that find each
+    other this way are linked, and the links are followed over the grid. If a corner is missing, or a false
+    one is linked, the function returns None and the finders take over.
 
     Args:
         grey: (H, W).
@@ -220,7 +220,7 @@ def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
     H[:, 0, 0], H[:, 1, 1], H[:, 0, 1] = duu[v, u], dvv[v, u], duv[v, u]
     H[:, 1, 0] = H[:, 0, 1]
     values, vectors = np.linalg.eigh(H)
-    # From the pixel to where the slope vanishes; Sobel's second derivatives are four times as large.
+    # Offset from the pixel to the zero of the slope; Sobel's second derivatives are four times as large.
     slope = np.stack([smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1) / 2
     shift = np.clip(-4.0 * np.linalg.solve(H, slope[..., None])[..., 0], -1.0, 1.0)
     # Along the edges the second derivative vanishes: between the eigenvectors, in the ratio of their values.
@@ -264,9 +264,9 @@ def _link(points: Array, edges: Array, strengths: Array) -> dict[int, dict[int, 
 def _follow_links(
     links: dict[int, dict[int, tuple[int, int]]], n_wanted: int
 ) -> dict[int, tuple[int, int]] | None:
-    """Return the points of one connected grid of at least so many (column, row); None if links disagree.
+    """Return (column, row) of the points of a connected grid of at least n_wanted; None if links disagree.
 
-    Corners of a grid have two neighbours at least: what has fewer hangs on to it by chance.
+    Corners of a grid have at least two neighbours; a point with fewer is linked by chance and dropped.
     """
     while loose := [i for i, sides in links.items() if len(sides) < 2]:
         for i in loose:

@@ -31,26 +31,26 @@ Places = dict[int, Array]
 """Corners (4, 2) px of markers by their ids."""
 # Images narrower than this are searched at twice their size first.
 _WIDE_PX = 700
-# Two markers show that they are the board's.
+# Minimum number of markers that identify the board.
 _MIN_MARKERS = 2
-# Markers and corners lie so near to where a pose has them, of a marker's side, or they are others.
+# Maximum distance of a marker's corners from the pose's prediction, in sides of a marker.
 _MAX_AWAY = 0.25
-# Of the markers that belong to a board, so many fit one pose if the profile has their layout.
+# Minimum share of the board's markers that fit one pose, if their layout is the profile's.
 _MIN_FITTING = 0.6
-# Of all markers, so many must be foreign to be those of the board in the image, or of a second one.
+# Minimum share of foreign markers for a refusal: another board is in the image, or a second one.
 _MIN_FOREIGN = 0.15
-# A corner's contrast is that of others at least, and its grey values differ from the model's so much at most.
+# Limits of a corner, relative to the others: minimum contrast, maximum misfit of the grey values.
 _MIN_CONTRAST, _MAX_MISFIT = 0.5, 2.0
-# It lies from where the board's pose has it no farther than others, in units of their median.
+# Maximum distance of a corner from the pose's prediction, in units of the median.
 _MAX_OFF = 7.0
-# A board that is followed is searched for again when more corners than this share of its own come into view.
+# Maximum ratio of new corners to followed ones; beyond, the board is searched for again.
 _MOST_NEW = 0.25
-# Edges are measured up to this share of the way to the next thing that is printed.
+# Measured length of edges, as a share of the way to the next printed element.
 _FREE = 0.8
-# Black is darker than its surroundings by so many grey values; by so many deviations of an AprilGrid's noise.
+# Threshold of black below its surroundings, grey values: least, most; in sigmas of an AprilGrid's noise.
 _DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
-# Gaps between tags may differ from the profile's by so much of a tag's side: more moves poses by centimetres.
-# What differs by fewer deviations of the measurement is not known to differ.
+# Limits of the gaps' difference from the profile's: in sides of a tag (more moves poses by centimetres), and
+# in standard deviations of the measurement (fewer are not significant).
 _MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
 _GAP_SHARES = (0.05, 1.2)
 
@@ -63,11 +63,11 @@ def find_marked_grid(
     Args:
         grey: (H, W).
         board: one that has markers.
-        intrinsics: of the camera; rough ones will do.
+        intrinsics: of the camera; rough ones are sufficient.
         is_thorough: whether to search at further scales, and for markers of other dictionaries.
 
     Returns:
-        Crossings with hidden corners at NaN; None if there are no markers; or why they are not the board's.
+        Crossings with hidden corners at NaN; None without markers; a refusal if they are not the board's.
     """
     places = _search(grey, board, is_thorough=is_thorough)
     wanted = range(board.first_id, board.first_id + len(markers_of(board).ids))
@@ -100,7 +100,7 @@ def keep_marked(
     Args:
         grey: (H, W).
         board: one that has markers.
-        crossings: fitted about where the corners were.
+        crossings: fitted about the corners' former places.
         was_seen: (rows, cols) which corners the board showed.
 
     Returns:
@@ -153,7 +153,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = n_border
     parameters.minMarkerPerimeterRate = 0.015
-    # Of tags with modules of 2 px, these find seven times as many as OpenCV's defaults.
+    # Finds seven times as many tags with modules of 2 px as OpenCV's defaults.
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.errorCorrectionRate = 1.0
@@ -170,15 +170,15 @@ def _noise(grey: Grey) -> float:
     """Estimate the standard deviation of an image's noise, by its second differences across both axes."""
     across = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     rough = cv2.filter2D(grey, cv2.CV_16S, across)[1:-1:3, 1:-1:3]
-    # Of normal noise, the median size is 0.67 standard deviations; the filter multiplies these by six.
+    # The median magnitude of normal noise is 0.67 standard deviations; the filter multiplies these by six.
     return float(np.median(np.abs(rough))) / (0.6745 * 6)
 
 
 def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
-    """Name the dictionary of which the image has more markers than the board's n_own; None if none has."""
+    """Find a dictionary with more markers in the image than the board's n_own; None if there is none."""
     own = _family(board.dictionary)
     best, most = "", max(n_own, 3)
-    # The largest of a family holds the markers of the smaller ones.
+    # The largest dictionary of a family includes the markers of the smaller ones.
     for name in DICTIONARIES:
         if not name.endswith(("_50", "_100", "_250")) and _family(name) != own:
             n_seen = max(len(_detect(grey, name, 1.0, n_border)) for n_border in (1, 2))
@@ -189,7 +189,7 @@ def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
 
 
 def _family(dictionary: str) -> str:
-    """Name a dictionary without its size, as "5X5" of 5X5_100; each of AprilTag's is a family of its own."""
+    """Return a dictionary's name without its size, as "5X5" of 5X5_100; each AprilTag one is a family."""
     return dictionary.partition("_")[0] if dictionary[0].isdigit() else dictionary
 
 
@@ -197,11 +197,11 @@ def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array 
     """Fit one pose to markers.
 
     OpenCV's releases differ by half a turn in the first corner of AprilTags, and by the squares with markers
-    of a ChArUco board with an even number of rows: the reading that more markers agree with is taken.
+    of a ChArUco board with an even number of rows: the reading that fits more markers is used.
 
     Returns:
-        The pose (4, 4); the number of markers that lie where it has them; and whether the board is a ChArUco
-        board of OpenCV's before 4.6, whose colours are exchanged.
+        The pose (4, 4); the number of markers that fit it; and whether the board is a ChArUco board of
+        OpenCV's before 4.6, whose colours are exchanged.
     """
     ids = sorted(places)
     pixels = np.array([places[number] for number in ids])
@@ -250,7 +250,7 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
         return float(np.sum((cv2.perspectiveTransform(on_board[None], H)[0] - flat) ** 2))
 
     found = minimize_scalar(misfit, bounds=_GAP_SHARES, method="bounded")
-    # Eight of a homography, and the gap.
+    # Nine unknowns: eight of a homography, and the gap.
     variance = found.fun / (2 * len(flat) - 9)
     is_other = misfit(board.gap_share) - found.fun > _GAP_SIGMAS**2 * variance
     return float(found.x) if is_other and abs(found.x - board.gap_share) > _MAX_GAP_OFF else None
@@ -283,7 +283,7 @@ def _fits(on_board: Array, flat: Array, is_ahead: NDArray[np.bool_]) -> NDArray[
 def _measure(
     grey: Grey, board: Board, intrinsics: Intrinsics, T_cam_board: Array, is_legacy: bool
 ) -> tuple[Crossings | None, int]:
-    """Measure the corners about where a pose has them; None if too few are seen, and their number."""
+    """Measure the corners near a pose's prediction; None if too few are visible, and their number."""
     shape, corners = (board.rows, board.cols), board.corners()
     signs = _signs(board) * (-1 if is_legacy else 1)
     grid_px = intrinsics.project(transform(T_cam_board, corners))[0].reshape(*shape, 2)
@@ -292,7 +292,7 @@ def _measure(
             return None, 0
         crossings = fit_crossings(grey, grid_px, patches=marked_patches(board, intrinsics, T_cam_board))
         is_seen = _as_printed(grey, crossings, signs)
-        # The better half of them is hardly covered: they alone give the first pose.
+        # The better half of them is hardly covered, so it alone determines the first pose.
         usual = np.median(crossings.misfit[is_seen]) if is_seen.any() else 0.0
         is_trusted = is_seen & (crossings.misfit <= usual)
         for _ in range(3):
@@ -308,7 +308,7 @@ def _measure(
             away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
             is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
             is_trusted, T_cam_board = is_seen, solved.T_cam_board
-        # Patches in the middles of which their corners lie are free of what is printed about them.
+        # Patches centred on their corners are free of neighbouring print.
         grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
     crossings.grid_px[~is_seen] = np.nan
     crossings.is_fitted[...] = is_seen
@@ -341,7 +341,7 @@ def marked_patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> 
     if board.type == "charuco":
         unit_m, clear_m = board.square_m, _FREE * (1 - board.marker_share) / 2 * board.square_m
     else:
-        # The next corner lies a gap away; a border of one module of eight is the narrowest.
+        # The next corner is a gap away; a border of one module of eight is the narrowest.
         unit_m, clear_m = _FREE * board.gap_share * board.square_m / REACH, _FREE * board.square_m / 8
     corners, shape = board.corners(), (board.rows, board.cols, 2)
     right, down = (

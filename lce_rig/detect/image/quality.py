@@ -28,11 +28,11 @@ LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
 LEAST_MARKED_PX = 20.0
 """Least side of a square with a marker, or of a tag, from which markers are read without fail."""
-# Of camera images: least difference of black and white, grey values, and fewest edge widths in a square.
+# Limits of camera images: least difference of black and white, grey values; fewest edge widths in a square.
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
-# Of images without a board: least grey spread, and widest of the strongest edges.
+# Limits of images without a board: least grey spread, and greatest width of the strongest edges.
 _MIN_SPREAD, _MAX_EDGE_PX = 50.0, 6.0
-# The outer squares of a line that is not on the board are all alike.
+# Minimum ratio of the outer squares' contrast to the inner ones'; off the board, a line's are all the same.
 _MIN_OUTER_CONTRAST = 0.35
 
 
@@ -57,7 +57,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
 
 
 def _shortest_side_px(grid_px: Array) -> float:
-    """Measure the shortest side of a square; where no two neighbours are visible, by other corners."""
+    """Measure the shortest side of a square, px; without visible neighbours, from other corners."""
     sides = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
     if np.isfinite(lengths).any():
@@ -70,7 +70,7 @@ def _shortest_side_px(grid_px: Array) -> float:
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
-    """Check that the pattern ends where the grid of corners says.
+    """Check that the pattern ends at the border of the grid of corners.
 
     The squares outside the outermost corners must alternate as those inside do, the next ones must not.
 
@@ -83,7 +83,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     """
     wide = _widened(_widened(grid_px))
     height, width = grey.shape
-    # Pixels beyond the border repeat its value, which alternates with nothing.
+    # Pixels beyond the border repeat its value, and so do not alternate.
     values = square_values(grey, np.clip(wide, 0, [width - 1, height - 1]))
     signs = (-1.0) ** np.indices(values.shape).sum(axis=0)
     inner = _alternation(values[2:-2, 2:-2], signs[2:-2, 2:-2])
@@ -99,7 +99,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
 
 
 def is_whole(grey: NDArray[np.uint8], grid_px: Array) -> bool:
-    """Tell whether a grid of corners is a whole pattern, and so its number of corners that of a board."""
+    """Check that a grid of corners is a whole pattern, and so its number of corners that of a board."""
     outer_contrast, goes_on = extent(grey, grid_px)
     return outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on
 
@@ -113,7 +113,7 @@ def _widened(grid_px: Array) -> Array:
 
 
 def _alternation(values: Array, signs: Array) -> float:
-    """Measure by how much the values of positive sign exceed the others."""
+    """Compute the mean excess of the values of positive sign over the others."""
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 
@@ -173,7 +173,7 @@ def explain_other_grid(
     if is_whole(grey, seen_px):
         figures |= {"n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     if is_part:
-        # A pattern that goes on beyond the corners found is neither covered nor another one.
+        # A pattern that continues beyond the corners found is neither covered nor another one.
         kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
         return kind.refusal(action=action, **figures)
     return IMAGE_OTHER_BOARD.refusal(**figures)

@@ -13,10 +13,10 @@ from lce_rig.core.geometry import Array
 # next corners stay outside.
 REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
-# Of the patches that bring corners to where the final ones need few steps; those take most of the time.
+# Samples per side and steps of a first, coarse fit; it saves steps of the final one, which is slower.
 _COARSE_SAMPLES = 9
 _COARSE_STEPS = 6
-# Of samples farther apart the image is blurred before.
+# Spacing of samples from which the image is blurred first, px.
 _FAR_APART_PX = 1.3
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
@@ -29,9 +29,9 @@ class Crossings:
     """The crossings fitted to a grid of corners.
 
     Attributes:
-        grid_px: (rows, cols, 2) corners; where a fit failed, as they were given.
+        grid_px: (rows, cols, 2) corners; the given ones if a fit failed.
         is_fitted: (rows, cols) whether the fit succeeded.
-        contrast: (rows, cols) white minus black, grey values; the sign tells the colour of the quadrants.
+        contrast: (rows, cols) white minus black, grey values; its sign is that of the quadrants' colours.
         edge_sigma_px: (rows, cols, 2) blur across the edges that run down the columns and along the rows.
         misfit: (rows, cols) rms of the grey values about the model.
     """
@@ -44,12 +44,12 @@ class Crossings:
 
 
 class Patches(NamedTuple):
-    """The surroundings of corners that are no squares of a checkerboard.
+    """The surroundings of corners that do not lie between squares of a checkerboard.
 
     Attributes:
         e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
         e2_px: (rows, cols, 2) one unit down on the board.
-        clear: distance from an edge, in units, beyond which something else is printed.
+        clear: distance from an edge, in units, up to which the surroundings are free of other print.
     """
 
     e1_px: Array
@@ -94,12 +94,12 @@ def _fit_patches(
     patches: Patches | None,
     n_steps: int = _STEPS,
 ) -> tuple[Crossings, Array]:
-    """Fit patches of at most so many samples a side; the parameters (K, 8) serve finer patches as start."""
+    """Fit patches of at most most_samples per side; parameters (K, 8) serve finer patches as a start."""
     if patches is None:
         patches = Patches(np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0), REACH)
     e1, e2, clear = patches
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
-    # Width of a square across its edges: what one unit of a and of b is in px.
+    # Width of a square across its edges: length of one unit of a and of b, px.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
     n = int(np.clip(2 * round(REACH * longest_px) + 1, 7, most_samples))
@@ -178,7 +178,7 @@ def _fit(
 
     `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
     """
-    # Without a start the corners are in the middles of their patches.
+    # Without a start the corners are assumed in the middles of their patches.
     mean = values.mean(axis=1)
     p, lowest = np.zeros((len(values), 8)), np.log(least_sigma_px / height_px)
     p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
@@ -189,7 +189,7 @@ def _fit(
     damping = np.full(len(p), 1e-2 if start is None else 1e-4)
     residuals, J = _model(p, values, a, b)
     cost = np.sum(residuals**2, axis=1)
-    k = np.arange(len(p))  # Those that are not done.
+    k = np.arange(len(p))  # Fits that are not done.
     for _ in range(n_steps):
         J_k = J if len(k) == len(p) else J[k]
         # Blurs at their bounds that would go beyond stay there: the others then settle in few steps.

@@ -33,18 +33,18 @@ from lce_rig.rig import QualitySettings
 
 STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
-"""Of a search that was not thorough."""
+"""Hint of a search that was not thorough."""
 
-# A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
+# Maximum excess of a canvas over the sensor, in sizes of the sensor; a larger one costs memory.
 _CANVAS_FRACTION = 3.0
-# Corners that the finder misplaced, or that an artefact covers, at most.
+# Maximum share of corners that the finder misplaced, or that an artefact covers.
 _MAX_MISPLACED = 0.08
 # A quarter of a full fit's time; the corners' standard deviation is then 0.03 px, sufficient for stillness
 # and guidance.
 _FOLLOWED_SAMPLES = 13
-# A board whose corners have moved by less stands still.
+# Maximum movement of a still board's corners, px.
 _RESTING_PX = 0.5
-# A grid of corners with a smaller measurable fraction is rejected.
+# Minimum measurable fraction of a grid's corners.
 _MIN_FITTED = 0.5
 
 
@@ -60,20 +60,20 @@ def find_image_board(
 ) -> ImageBoard | Refusal:
     """Find the board's inner corners in one image and T_cam_board in both its minima.
 
-    Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
+    Corners are in the order of `Board.corners()`. A pattern that is not symmetric under 180 deg is read with
     the outer square at its top left black; a symmetric one with its top row up in the image. Of a board with
-    markers, which name the corners, a part is enough.
+    markers, which identify the corners, a part is sufficient.
 
     Args:
         image: the image.
         board: the board as the profile describes it.
         intrinsics: of the camera, at the image's resolution.
-        last: the board in the image before: where it is there still, or within a third of a square, nothing
-            is searched; else its surroundings are searched first.
+        last: the board in the previous image: if it is within a third of a square of its place there, the
+            search is skipped; else its surroundings are searched first.
         limits: `quality` of the rig profile.
-        is_from_events: whether the image was reconstructed from events, ours or another's.
-        is_thorough: whether a board that is not found at once is searched for at other scales, and its
-            absence explained, which takes most of a second.
+        is_from_events: whether the image was reconstructed from events, by us or by others.
+        is_thorough: whether to search at further scales for a board that is not found at once, and to explain
+            its absence, which takes most of a second.
 
     Raises:
         ProfileError: the intrinsics belong to images of another size.
@@ -171,9 +171,9 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
 def _follow(
     grey: NDArray[np.uint8], board: Board, intrinsics: Intrinsics, last: ImageBoard
 ) -> Crossings | None:
-    """Fit the corners from where they were; None if the board is not all there.
+    """Fit the corners from their places in the previous image; None unless all of the board is there.
 
-    A board that moved by a whole square is not taken for itself: on one side squares are missing then.
+    A board that moved by a whole square is not mistaken for itself, as squares are missing on one side.
     """
     start_px, patches = last.corners_px.reshape(board.rows, board.cols, 2), None
     was_seen = np.asarray(np.isfinite(start_px).all(axis=-1))
@@ -197,7 +197,7 @@ def _follow(
 def _find_near(
     grey: NDArray[np.uint8], board: Board, last: ImageBoard | None, *, is_thorough: bool
 ) -> Crossings | None:
-    """Search about where the board was."""
+    """Search near the board's last place."""
     if last is None:
         return None
     # The corners' box, larger by half its size.
@@ -219,10 +219,11 @@ def _solve(
     intrinsics: Intrinsics,
     near: Sequence[Array] = (),
 ) -> tuple[PlanarPose | None, Crossings]:
-    """Solve for the pose; corners far from the board's image are looked for again where they should be.
+    """Solve for the pose; corners far from the board's image are searched again at their predicted places.
 
-    A finder puts single corners onto an artefact now and then. Few of them are fitted again from where the
-    others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.
+    A finder puts single corners onto an artefact now and then. If they are few, they are fitted again from
+    the places that the others predict; a corner whose fit fails there takes that place and no longer counts
+    in `n_corners`.
     """
     corners_board = board.corners()
     solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics, near)

@@ -23,12 +23,12 @@ from lce_rig.detect.lidar.template import (
 
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
-_MAD = 1.4826  # the standard deviation of normal noise over its median size
+_MAD = 1.4826  # standard deviation of normal noise over its median magnitude
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
-_MIN_SMEARED = 8  # ring ends, fewest whose scatter measures a smear: a fit takes five freedoms
-_CROSSING = 0.3  # least part of its gaps by which a ring crosses a side, for ends that show a smear
+_MIN_SMEARED = 8  # minimum number of ring ends to measure a smear: a fit takes five freedoms
+_CROSSING = 0.3  # minimum share of its gaps by which a ring crosses a side, for ends that show a smear
 SIZE_PRIOR_M = 0.10
-SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
+SLACK_M = 0.05  # maximum distance of a measured border from the nominal one
 
 
 class RingEnds(NamedTuple):
@@ -52,14 +52,14 @@ class RingEnds(NamedTuple):
 
 
 def median(values: Array) -> float:
-    """Take the median: on a few hundred values several times faster than `numpy.median`."""
+    """Compute the median: on a few hundred values several times faster than `numpy.median`."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     ordered = np.sort(values)
     return float(ordered[low] + ordered[high]) / 2
 
 
 def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
-    """Take the first and last board return of each ring and look at the beams beyond them.
+    """Find the first and last board return of each ring and examine the beams beyond them.
 
     Args:
         scan: all returns.
@@ -165,14 +165,14 @@ def measure_size(
 
 
 def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Array) -> Array:
-    """Measure by how much ring ends scatter about the border beyond their steps: (E,) m, 0 where it is sharp.
+    """Measure the scatter of ring ends about the border beyond their steps: (E,) m, 0 for a sharp border.
 
-    The third quartile of their distances measures it, of all ends and of each side's: a few that lost their
-    last returns do not count, nor do those of rings that hardly cross the side that is nearest.
+    It is the third quartile of the distances, of all ends and of each side's. So a few ends that lost their
+    last returns do not count, nor do those of rings that hardly cross the nearest side.
 
     Args:
         ends: ring ends.
-        side: (E,) side of the fitted rectangle that each is nearest to.
+        side: (E,) nearest side of the fitted rectangle.
         residual_m, step_m: of them, by `measure_size`.
     """
     smear_m = np.zeros(len(side))
@@ -193,8 +193,8 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
 SURROUND_M = 0.20
 MIN_POINTS = 12
 EDGE_TOLERANCE_M = 0.012
-BORDER_M = 0.06  # how bright the board is near its outline is asked of returns so near to it
-SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
+BORDER_M = 0.06  # width inside the outline of the returns that measure the board's brightness there
+SETTLED_M = 0.01  # movement of the outline too small to change the returns inside it, and so the plane
 
 
 Distance = TypeVar("Distance", float, Array)
@@ -205,9 +205,9 @@ class Beam:
     """The light spot of a LiDAR, a VLP-16's by default: half of it reaches over an edge of the board.
 
     Attributes:
-        aperture_m: width of the beam where it leaves the sensor.
+        aperture_m: width of the beam at the sensor's exit.
         divergence_rad: full angle by which it widens.
-        upright_rad: the same upwards; None for as much as sideways.
+        upright_rad: the same upwards; None for the same as sideways.
     """
 
     aperture_m: float = VLP_16.aperture_m
@@ -272,10 +272,10 @@ def refine(
     Args:
         scan: all returns.
         plane: (4,) first guess.
-        centre: (3,) m, the point of the plane the placement is counted from.
+        centre: (3,) m, origin of the placement in the plane.
         placement: first guess of the outline.
-        limit_m: largest error of an outline; what is worse is not improved further.
-        max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
+        limit_m: largest error of an outline; a worse one is not improved further.
+        max_beyond: most returns in the plane beyond the outline, per return inside, for further work.
         dark_m, may_be_hidden: as in the view.
 
     Returns:
@@ -326,7 +326,7 @@ def build_board(
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
     away = placement.distance_m(view.uv)
-    # A plate somewhat larger than it should be is to be measured, not cut to size.
+    # A slightly larger plate is measured at its full size, not cut to the nominal one.
     ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
     fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
     away = fitted.distance_m(view.uv)

@@ -23,13 +23,13 @@ from lce_rig.detect.lidar.template import Placement
 
 N_ANGLES = 9
 _OUTLIERS = 0.02
-# Rays farther from the border say nothing of its place.
+# Distance from the border beyond which rays do not locate it, m.
 _BAND_M = 0.10
 # Blurs of the first rounds, which catch a start that is off; wider ones for a plate that is only about there.
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
-# Share of rays that contradict a clear plate's placement.
+# Maximum share of rays that contradict a clear plate's placement.
 _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
@@ -43,7 +43,7 @@ class Rays:
     """Rays that pierce a plate's plane, M of them.
 
     Attributes:
-        uv: (M, 2) where they do, m.
+        uv: (M, 2) points of intersection with the plane, m.
         is_on: (M,) whether they return from the plane; else they passed beside the plate.
     """
 
@@ -60,7 +60,7 @@ class Outline(NamedTuple):
 
     Attributes:
         placement: with the nominal size; `error_m` is the mean of -ln P over the rays near the border.
-        growth_m: (2,) by how much half its width and half its height exceed the nominal ones.
+        growth_m: (2,) excess of half its width and half its height over the nominal ones.
         cov: (5, 5) of u, v, angle and growth.
     """
 
@@ -72,7 +72,7 @@ class Outline(NamedTuple):
 def thin(n: int, most: int) -> Indices:
     """Choose about `most` of n returns at random, the same ones each time, or all of fewer.
 
-    At even steps, they would be those of some of a LiDAR's lines, which recur in order and err alike.
+    Even steps would pick a few of a LiDAR's lines, which recur in order and have the same errors.
     """
     if n <= most:
         return np.arange(n)
@@ -115,7 +115,7 @@ def fit_outline(
         blur = np.maximum(blur_m(placement.axes), least)
         p, slopes = _probability(local, half + x[3:], blur)
         is_on = rays.is_on[near]
-        # By u, v, angle and growth; the shift is counted along the rectangle's axes.
+        # In the order u, v, angle, growth; the shift is along the rectangle's axes.
         right, left, top, bottom = slopes
         by_x, by_y = right - left, top - bottom
         turned = by_x * local[:, 1] - by_y * local[:, 0]
@@ -148,7 +148,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
 
 
 def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
-    """Find the middle (2,) of what is wider than half the plate's short side, m: a stand is narrower.
+    """Find the middle (2,) of the parts wider than half the plate's short side, m: a stand is narrower.
 
     The middle of a patch lies towards the stand that its plate merges with.
     """
@@ -215,7 +215,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
     """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (4, M) by each distance s_e.
 
-    Sides are right, left, top and bottom; `blur` is of each, or of the first and the last two alike.
+    Sides are right, left, top and bottom; `blur` has one value per side, or one per pair of sides.
     """
     from scipy.special import ndtr
 
@@ -233,9 +233,9 @@ class Strips(NamedTuple):
     """Short pieces of the border, each measured on its own: K of them.
 
     Attributes:
-        uv: (K, 2) their middles where the plate's returns end, m.
+        uv: (K, 2) their middles at the end of the plate's returns, m.
         outwards: (K, 2) unit normals.
-        off_m: (K,) by how much farther out they lie than the fitted outline.
+        off_m: (K,) distance outwards from the fitted outline.
         sigma_m: (K,) standard deviations.
         side: (K,) of `measure_smears`.
     """
@@ -272,7 +272,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
-            # Where no ray comes near the border, it may lie anywhere between the rays on its two sides.
+            # Without a ray near the border, it may lie anywhere between the rays on its two sides.
             p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr((_OFFSETS_M[:, None] - s) / blur)
             log_p = np.log(np.where(is_on, p, 1 - p))
             total = np.stack([np.bincount(strip, row, n_strips) for row in log_p])

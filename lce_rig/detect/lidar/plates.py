@@ -11,12 +11,12 @@ from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Indices, OrderedSca
 from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 
 MAX_PAIRS = 400
-CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one cell count as alike
+CELL = 0.5  # of the board's diagonal: with too many pairs, those of one cell count as alike
 N_ROUNDS = 2
 BLOCK = 32  # of centres, whose distances fit the cache
 MAX_PLATES = 10
-MIN_LONG = 4  # chords across the plate, fewest that locate it beside a stand
-MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
+MIN_LONG = 4  # minimum number of chords across the plate that locate it beside a stand
+MAX_JOINT = 4  # maximum returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Plates:
 
     @staticmethod
     def none() -> "Plates":
-        """Give no plate at all."""
+        """Return an empty set of plates."""
         return Plates.of(np.ones((0, 13)), np.zeros(0, dtype=np.intp))
 
     @staticmethod
@@ -90,7 +90,7 @@ def propose_plates(
     for _ in range(2 * N_ROUNDS if is_blurred.any() else N_ROUNDS):
         row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
         plates = _fit(row, column, segments, sums)
-        # The same members give the very same sums.
+        # The same members give identical sums.
         is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
         is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
         is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 2.0 * diagonal_m)
@@ -245,7 +245,7 @@ def _different(plates: Plates, candidates: Indices, board: Board) -> Indices:
     """Choose the most board-like plate of each place and orientation, the best first."""
     long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
     misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
-    # Few rings say little about a size; many returns on a wrong size say no.
+    # Few rings leave the size open; many returns on a wrong size exclude the board.
     rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
     rank = rank[: 20 * MAX_PLATES]
     centre, normal = plates.centre[rank], plates.plane[rank, :3]
@@ -272,8 +272,8 @@ def screen_plates(
         ends: (K, M, 2) as of `propose_plates`.
         board: gives the rectangle.
         limit_m: largest error of an outline.
-        on_stand: whether to leave out chords shorter than half the board's short side: what the plate stands
-            on, flush with it, is narrower than the plate and ends elsewhere.
+        on_stand: whether to leave out chords shorter than half the board's short side: a stand flush with the
+            plate is narrower than the plate, and its chords end elsewhere.
     """
     if len(plates.centre) == 0:
         return []

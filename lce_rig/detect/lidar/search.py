@@ -32,8 +32,8 @@ from lce_rig.detect.lidar.template import (
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
-SCATTER_M = 0.02  # by how much more than the LiDAR's noise returns of a plate may scatter to be named
-# Sum of |log| of the ratios of long and short side up to which a plate is worth naming.
+SCATTER_M = 0.02  # scatter added to the LiDAR's noise in the search for plates to name
+# Maximum sum of |log| of the ratios of long and short side for a plate to be named.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
@@ -43,7 +43,7 @@ class Limits:
     """Limits of the search, and for accepting a plate as the board.
 
     Attributes:
-        template_m: largest mean distance of the outline from where the rings end.
+        template_m: largest mean distance of the outline from the ends of the rings.
         rms_m: largest rms distance of the returns from the plane.
         min_rings: fewest rings on the board.
         min_range_m: nearer returns are ignored.
@@ -82,7 +82,7 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
 
     Args:
         view: beams about the plate.
-        placement: where the outline fits best.
+        placement: the best fit of the outline.
         limit_m: largest error of an outline.
         rms_limit_m: largest rms distance of the returns from the plane.
     """
@@ -103,9 +103,9 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
 
 
 def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
-    """Refuse a scan in which no plate is the board, naming what comes nearest to it.
+    """Refuse a scan in which no plate is the board, naming the most similar one.
 
-    The search is repeated for plates of any size and of returns that scatter more than the LiDAR's do.
+    The search is repeated for plates of any size, with more scatter than the LiDAR's noise.
 
     Args:
         scan: all returns.
@@ -145,12 +145,12 @@ def other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
 
 
 MAX_CANDIDATES = 4
-# A plate with as many rings and as little else in its plane is clear.
+# Limits of a clear plate: minimum rings, maximum share of other returns in its plane.
 CLEAR_RINGS = 6
 CLEAR_SHARE = 0.05
-# Beside a clear board, a plate with such a share of returns beyond its outline is a patch of a wall.
+# Share of returns beyond the outline from which, beside a clear board, a plate is a patch of a wall.
 PATCH_SHARE = 0.20
-# Beyond this incidence dark squares may return nothing; so many of the beams on the board must be lost.
+# Incidence beyond which dark squares may return nothing, and minimum share of the beams lost there.
 GRAZING_RAD = np.radians(35.0)
 LOST_SHARE = 0.10
 
@@ -168,11 +168,11 @@ def find_lidar_boards(
 
     Args:
         scan: one revolution, or part of one.
-        board: the outer size is what is looked for.
+        board: for its outer size.
         limits: without noise.
 
     Returns:
-        At most 4 boards that do not overlap, or why there is none.
+        At most 4 boards that do not overlap, or the refusal.
 
     References:
         LCE-Calib, "Automatic Feature Extraction From LiDARs": selection and features.
@@ -215,15 +215,15 @@ def measure_plate(
 
     Args:
         ordered: the returns of the scan.
-        scan: where they come from.
+        scan: their scan.
         board: nominal size.
-        start: first guess of the plane (4,) as (n, d), its point (3,) in m that the outline is counted from,
-            and the outline.
+        start: first guess of the plane (4,) as (n, d), its point (3,) in m that is the outline's origin, and
+            the outline.
         limits: with the scan's noise.
-        max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
+        max_beyond: largest share of returns in the plane beyond the guessed outline.
 
     Returns:
-        The board, why it is refused, None if there is no plate.
+        The board, the refusal of a plate, or None without a plate.
     """
     refined = refine(ordered, *start, limits.template_m, max_beyond)
     if refined is None:
@@ -232,7 +232,7 @@ def measure_plate(
     if placement.error_m > STANDARD.template_m:
         view, placement = _past_dark_squares(ordered, board, start, limits, max_beyond) or refined
     if placement.error_m > limits.template_m:
-        # A border that something hides tells only that the plate goes on there.
+        # Beams at a hidden border only show that the plate reaches that far.
         view, placement = (
             refine(ordered, *start, limits.template_m, max_beyond, may_be_hidden=True) or refined
         )
@@ -243,7 +243,7 @@ def measure_plate(
         return None
     n_rings, distance_m = measured.quality.n_rings, measured.quality.distance_m
     if n_rings < limits.min_rings:
-        # The number of rings goes with 1 / distance.
+        # The number of rings is proportional to 1 / distance.
         closer_m = max(0.1, distance_m * (1.0 - n_rings / limits.min_rings))
         return LIDAR_TOO_FEW_RINGS.refusal(
             n_rings=n_rings, min_rings=limits.min_rings, distance_m=distance_m, closer_m=closer_m
@@ -263,7 +263,7 @@ def _past_dark_squares(
 ) -> tuple[PlaneView, Placement] | None:
     """Register the outline of a board whose dark squares, grazed by beams, return nothing or too far off.
 
-    Such beams say nothing about the outline; the others must fit it as without noise. Of boards at 42 to
+    Such beams do not locate the outline; the others must fit it as without noise. Of boards at 42 to
     66 deg before a VLP-16 and a VLP-32C, 12 to 41 % of the beams are lost; of walls and tables at most 9 %.
 
     Args:
@@ -307,7 +307,7 @@ def _penalty(found: LidarBoard, board: Board) -> float:
     return penalty
 
 
-MARGIN_M = 0.25  # by how much the box that is searched reaches beyond the board on every side
+MARGIN_M = 0.25  # margin of the searched box around the board, on every side
 LOOK_TURN = np.cos(np.radians(15.0))
 
 
@@ -317,18 +317,18 @@ def look_for_board(
     T_lidar_board: Array,
     limits: Limits = STANDARD,
 ) -> LidarBoard | Refusal:
-    """Find the board about a predicted pose, as an image and extrinsics give it or an earlier scan.
+    """Find the board about a pose predicted from an image and extrinsics, or from an earlier scan.
 
     The outline is registered from that pose; where this fails, the box about it is searched.
 
     Args:
         scan: one revolution.
-        board: the outer size is what is looked for.
+        board: for its outer size.
         T_lidar_board: (4, 4) predicted.
         limits: without noise; the search has no maximum range.
 
     Returns:
-        The board, or why none is there.
+        The board, or the refusal.
 
     References:
         LCE-Calib, "Checkerboard Tracking".
@@ -350,7 +350,7 @@ def look_for_board(
 def board_at(
     found: list[LidarBoard] | Refusal, T_lidar_board: Array, cause: Refusal | None = None
 ) -> LidarBoard | Refusal:
-    """Choose the board that lies where a pose (4, 4) has it; or refuse, by a cause or that of the search."""
+    """Choose the board at a pose (4, 4), or refuse, with the given cause or the search's."""
     if isinstance(found, Refusal):
         cause = cause or found
         return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
@@ -362,7 +362,7 @@ def board_at(
 def _measure_at(
     scan: Scan, board: Board, T_lidar_board: Array, limits: Limits
 ) -> LidarBoard | Refusal | None:
-    """Register and measure the outline from a pose; returns what `measure_plate` does."""
+    """Register and measure the outline from a pose, as `measure_plate`."""
     ordered = order_scan(scan, limits.min_range_m)
     if len(ordered.index) == 0:
         return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
@@ -375,6 +375,6 @@ def _measure_at(
 
 
 def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
-    """Return whether a board lies where a pose has it."""
+    """Return whether a board is at a pose."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
     return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > LOOK_TURN

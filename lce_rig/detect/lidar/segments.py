@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 Indices = NDArray[np.intp]
 Floats = NDArray[np.float32]
 
-# The board is found up to this angle between its normal and the beam; more is not a useful view.
+# Maximum angle between the board's normal and the beam, rad; more is not a useful view.
 MAX_INCIDENCE_RAD = np.radians(70.0)
 MIN_POINTS = 4  # returns that make a segment
 MAX_STEPS = 3.6  # firings from one return to the next on the same surface; dark squares drop single ones
@@ -158,14 +158,14 @@ def _azimuth_step(turn: Floats) -> float:
         return 0.0
     middle = float(np.median(forward[:: 1 + len(forward) // 1000]))
     common = forward[np.abs(forward - middle) < 0.3 * middle]
-    # Of a few returns, such as are left about where a board was, two steps may have nothing in common.
+    # Among a few returns, such as those left about a board's place, two steps may have nothing in common.
     return float(np.mean(common, dtype=np.float64)) if len(common) else middle
 
 
 def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:
     """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
 
-    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the rest.
+    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is used, as edges and foliage spoil the rest.
     """
     second = np.abs(range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])
     is_plain = (ring[:-2] == ring[2:]) & (turn[1:-1] < 0.01) & (turn[2:] < 0.01)
@@ -179,7 +179,7 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
 def cut_segments(scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf) -> Segments:
     """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
 
-    A run whose returns leave its chord is cut where they leave it most, as a polyline is simplified.
+    A run with returns off its chord is cut at the farthest one, as a polyline is simplified.
 
     Args:
         scan: all returns.

@@ -13,8 +13,8 @@ N_ANGLES = 12
 CAP_M = 0.10
 MAX_SAMPLES = 64
 MIN_ON_RING = 3  # returns that make a chord
-DARK_DEPTH_M = 0.10  # a dark square that a beam grazes is measured as lying so far behind the plane at most
-# What a beam says about the outline: it ends a chord, or should lie inside or outside.
+DARK_DEPTH_M = 0.10  # maximum depth behind the plane measured for a dark square that a beam grazes
+# Role of a beam for the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)
 
 
@@ -31,7 +31,7 @@ class PlaneView:
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
         dark_m: longest way across a dark square whose beams return nothing, or weakly from too far; 0 where
-            all squares return alike.
+            all squares return the same.
         may_be_hidden: whether the border may lie farther out than where a ring ends behind another surface.
     """
 
@@ -89,7 +89,7 @@ class Placement:
         return np.array([[cosine, sine], [-sine, cosine]])
 
     def local(self, uv: Array) -> Array:
-        """Take points (..., 2) of the plane view to the rectangle's axes, m."""
+        """Convert points (..., 2) of the plane view to the rectangle's axes, m."""
         return np.asarray((uv - [self.u_m, self.v_m]) @ np.ascontiguousarray(self.axes.T))
 
     def distance_m(self, uv: Array) -> Array:
@@ -126,7 +126,7 @@ def view_plane(
         among: (K,) of them that are tried.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
-        radius_m: of the disc that is looked at.
+        radius_m: of the disc examined.
         tolerance_m, dark_m: as in the view.
     """
     normal, d = plane[:3], plane[3]
@@ -163,7 +163,7 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
     Args:
         scan: all returns.
         view: beams about the plate.
-        placement: where the board is thought to be.
+        placement: estimated place of the board.
 
     Returns:
         First and last beam of each run (C,), as indices into the view.
@@ -220,7 +220,7 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
 
 
 def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Array, Indices]:
-    """Collect what beams say about the outline: points (M, 2) of the view and their kind (M,)."""
+    """Collect the beams that locate the outline: points (M, 2) of the view and their kind (M,)."""
     first, last = find_chords(scan, view, placement)
     ends = view.uv[np.concatenate([first, last])]
     bound = np.zeros(len(view.uv) + 1, dtype=np.int8)
@@ -228,11 +228,11 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
     bound[last + 1] -= 1
     is_inside = view.is_on & (np.cumsum(bound[:-1]) > 0)
     inside, outside = view.uv[is_inside], view.uv[view.is_behind]
-    # Beams far from any border say the same as their neighbours: a sample is enough.
+    # Beams far from any border repeat their neighbours, so a sample is enough.
     inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
     outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
-    # The border lies farther out than an end beyond which a dark square may lie, or that something hides.
+    # The border lies farther out than an end that is hidden, or beyond which a dark square may lie.
     if view.dark_m:
         kind[: len(ends)][_is_before_dark(scan, view, first, last)] = INSIDE
     if view.may_be_hidden:
@@ -241,9 +241,9 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
 
 
 def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> NDArray[np.bool_]:
-    """Tell between which neighbours of the beams on the plane (K,) a dark square may lie (K - 1,).
+    """Find the pairs of neighbouring beams on the plane (K,) with a possible dark square between (K - 1,).
 
-    The way between them is short and inside the outline, and no beam between them returns from elsewhere.
+    The two are close together and inside the outline, and no beam between them returns from elsewhere.
     """
     is_inside = placement.distance_m(view.uv[on]) < 0
     is_short = np.linalg.norm(np.diff(view.uv[on], axis=0), axis=1) <= view.dark_m
@@ -253,14 +253,14 @@ def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> 
 
 
 def _is_before_dark(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Tell beyond which ends (2 C,) of chords the ring goes on, but not with a beam that passes by."""
+    """Find ends (2 C,) of chords beyond which the ring goes on, but not with a beam that passes by."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     passes = view.is_behind[beyond] & is_next
     return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
 
 
 def _is_before_cover(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Tell beyond which ends (2 C,) of chords the next beam returns from before the plane."""
+    """Find ends (2 C,) of chords beyond which the next beam returns from before the plane."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     is_same = scan.ring[view.member[beyond]] == scan.ring[view.member[end]]
     return np.asarray(is_same & is_next & (view.height_m[beyond] > view.tolerance_m))
@@ -281,7 +281,7 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
     """Find for each of G plates the placement of the board's outline whose border is nearest to its ends.
 
     Args:
-        ends: (G, M, 2) where the rings begin and end in each plate's plane, m; NaN fills the rows up.
+        ends: (G, M, 2) start and end of the rings in each plate's plane, m; NaN fills the rows up.
         board: gives the rectangle.
     """
     half = (board.width_m / 2, board.height_m / 2)
@@ -351,7 +351,7 @@ def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]
 
 
 def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float], scale_m: float) -> Array:
-    """Take one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
+    """Compute one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
     residual, x, y, away = _residuals(state, samples, kind, half)
     weight = (residual != 0) / (1.0 + (residual / scale_m) ** 2) ** 2
     over_x, over_y = np.abs(x) - half[0], np.abs(y) - half[1]
@@ -359,7 +359,7 @@ def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float]
     is_outside, scale = away > 0, np.maximum(away, 1e-12)
     along_x = np.copysign(np.where(is_outside, np.maximum(over_x, 0.0) / scale, over_x > over_y), x)
     along_y = np.copysign(np.where(is_outside, np.maximum(over_y, 0.0) / scale, over_x <= over_y), y)
-    # The shift is counted along the rectangle's axes, which spares turning every gradient.
+    # The shift is along the rectangle's axes, which saves rotating every gradient.
     jacobian = np.empty((*residual.shape[:2], 3, residual.shape[2]))
     np.negative(along_x, out=jacobian[:, :, 0])
     np.negative(along_y, out=jacobian[:, :, 1])

@@ -43,40 +43,40 @@ from lce_rig.detect.lidar.search import (
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Floats
 from lce_rig.detect.lidar.template import Placement, PlaneView, plane_axes, view_plane
 
-# Cells per short side of the board: of 6 cm for a plate of 0.63 m.
+# Cells per short side of the board: 6 cm for a plate of 0.63 m.
 _CELLS = 10.0
-# Accumulated point clouds hold millions of points: enough of them find the plates, and measure one.
+# Maximum points used of an accumulated cloud, which holds millions: to find plates, and to measure one.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
-# So many returns, or rays, find about where plane and outline are, before all of them locate them.
+# Number of returns, or of rays, for a first estimate of plane and outline; all of them locate both.
 _ROUGH = 6_000
 _MOST_PATCHES = 8
-# Sum of |log| of its sides over the board's up to which a patch may be it, though another is found.
+# Maximum sum of |log| of a patch's sides over the board's to be the board, if another patch is found.
 _ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
-_NOISE_M = 0.012  # of a plane's returns, at most before the noise of the cloud itself is measured
+_NOISE_M = 0.012  # maximum noise of a plane's returns, assumed until the cloud's own is measured
 _SURROUND_M = 0.25
 _MIN_POINTS = 60
-# Directions of a rosette's beams err by about this much.
+# Approximate error of the directions of a rosette's beams, rad.
 _DIRECTION_RAD = 7e-4
-# Share of the plate without any return from which it reaches out of the field of view.
+# Share of the plate without returns from which it reaches out of the field of view.
 _DARK_SHARE = 0.08
 _BEHIND_M, _FOOT_M = 0.05, 0.15
 # Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
-# Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
+# Limits of another plate: share of rays that contradict the best placement, and growth of the outline.
 _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
-# Rays farther beyond a located border should pass the plate.
+# Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
-# Of boards that stood still, 5 mm at most on recordings; wider borders count by their width.
+# Maximum blur of a still board's border, m (5 mm at most on recordings); a wider border counts by its width.
 _MOST_SMEAR_M = 0.008
-# Parts, in order of time, whose places tell whether a plate moved; their chi2 of 6 freedoms, p = 1e-4.
+# Parts, in order of time, to detect that a plate moved, and the limit of their chi2 (6 freedoms, p = 1e-4).
 _N_PARTS, _MOVED_CHI2 = 4, 27.9
-# Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
+# Minimum number of located places on upright and on level edges, and of means on the plate, to fix its pose.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
 
 
@@ -87,7 +87,7 @@ def find_unstructured_boards(
 
     Args:
         scan: one scan, or several of a still board together.
-        board: the outer size is what is looked for.
+        board: for its outer size.
         limits: without noise.
     """
     points = np.asarray(scan.points, dtype=np.float64)
@@ -136,7 +136,7 @@ def look_for_unstructured_board(
 
 
 def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[np.bool_]:
-    """Find which rays (N,) pass the board's middle so closely that they may tell where it ends."""
+    """Find the rays (N,) that pass the board's middle closely enough to locate its border."""
     reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + _SURROUND_M
     squared_cosine = 1.0 / (1.0 + (reach_m / np.linalg.norm(centre)) ** 2)
     along = points @ (centre / np.linalg.norm(centre)).astype(points.dtype)
@@ -179,7 +179,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     count = np.bincount(label)
     large = np.flatnonzero(count >= 8)
     large = large[np.argsort(-count[large], kind="stable")]
-    # Each cell counts alike: a rosette is densest in its middle.
+    # Each cell has the same weight: a rosette is densest in its middle.
     alike = sums / sums[:, :1]
     totals = [np.bincount(label, column, n_patches)[large] for column in alike.T]
     return Plates.of(np.array(totals, dtype=np.float64).T, np.zeros(len(large), dtype=np.intp))
@@ -209,7 +209,7 @@ class _View(PlaneView):
     """The view of a plate in a point cloud without rings.
 
     Attributes:
-        returns: (M, 4) x, y, z, intensity; intensities are all the same where the point cloud has none.
+        returns: (M, 4) x, y, z, intensity; intensities are all the same if the point cloud has none.
         beam: the LiDAR's.
     """
 
@@ -253,7 +253,7 @@ class _View(PlaneView):
         return np.asarray(np.hypot(self.half_beam_m(normals) / 2, _DIRECTION_RAD * distance_m))
 
     def growth_m(self, placement: Placement) -> tuple[Array, float]:
-        """Predict by how much half width and half height of a plate seem larger, and how well it is known."""
+        """Predict the excess of half width and half height of a plate (2,), and its standard deviation, m."""
         expected = self.half_beam_m(placement.axes)
         return expected, float(expected.max()) / 2 + 0.005
 
@@ -261,12 +261,12 @@ class _View(PlaneView):
         """Sort rays into those that return from the plate and those that passed beside it.
 
         Rays that return from before the plane, or just behind it where echoes of plate and background blend,
-        say nothing; but what a plate stands on, or touches, ends it. Places without any return count as
-        passed, unless they lie on a first placement.
+        are left out, except that a stand or a touching object ends the plate. Places without any return count
+        as passed, unless they lie on a first placement.
 
         Args:
             half_m: half width and half height of the plate.
-            placement: where it is about; None if only its middle is known.
+            placement: its rough placement; None if only its middle is known.
         """
         is_on = self.is_on
         is_beside = self.height_m < -max(self.tolerance_m, _BEHIND_M)
@@ -350,7 +350,7 @@ def measure_unstructured(
 
 
 def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refusal:
-    """Check what a fitted outline encloses and sum up the board."""
+    """Check the returns inside a fitted outline and sum up the board."""
     placement = outline.placement
     distance_m = float(np.linalg.norm(view.origin))
     away = placement.distance_m(view.uv)
@@ -360,7 +360,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     deep = away < -margin_m
     beyond = float(np.count_nonzero(view.is_on & (away > margin_m) & (away < 0.15))) / max(n_on, 1)
     dark, cell_m = _empty_places(view.uv, placement, n_on)
-    # A cell at the rim is dark only if its neighbours are: count what they hide of it.
+    # A cell at the rim is dark only if its neighbours are, so the share counts the hidden part of it.
     n_dark = np.count_nonzero(placement.distance_m(dark) < 0)
     dark_share = n_dark * cell_m**2 / (board.width_m * board.height_m)
     sheet = view.height_m[deep & (np.abs(view.height_m) < 0.06)]
@@ -382,14 +382,14 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         if moved_m is not None:
             return LIDAR_MOVED.refusal(distance_m=distance_m, moved_m=moved_m)
         strips = measure_strips(rays, outline, view.blur_m, smears_m)
-    # A strip that lies elsewhere than its neighbours shows what touches the border, or hides it.
+    # A strip off its neighbours is touched or hidden by something.
     strip_smear_m = smears_m[strips.side]
     is_good = (strips.sigma_m < np.hypot(_STRIP_SIGMA_M, strip_smear_m)) & (
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
     is_touched, behind_m, echo = _look_beyond(view, strips, placement)
     is_good &= ~is_touched
-    # Upright edges tell the plate's place along its width, the others along its height: both are needed.
+    # Upright edges locate the plate along its width, the others along its height: both are needed.
     is_upright = np.abs(strips.outwards[is_good] @ placement.axes[0]) > np.sqrt(0.5)
     n_upright, n_level = int(np.count_nonzero(is_upright)), int(np.count_nonzero(~is_upright))
     if min(n_upright, n_level) < _MIN_STRIPS:
@@ -422,7 +422,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     beam_m = view.beam_parts_m(strips.outwards, strips.uv)
     inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
-    # All strips of a side may err alike: together they count as one place, as well known as it is wide.
+    # The errors of a side's strips may be the same, so together they count as one place of their width.
     n_of_side = np.bincount(strips.side[is_good], minlength=4)[strips.side[is_good]]
     edge_sigma_m = strip_smear_m[is_good] * np.sqrt(n_of_side)
     return LidarBoard(
@@ -493,10 +493,10 @@ def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | N
 
 
 def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Look at what is beyond each strip of the border (K,).
+    """Examine the returns beyond each strip of the border (K,).
 
     Returns:
-        Whether something hides it, a hand or a box; `edge_behind_m` and `edge_echo` of `LidarBoard`.
+        Whether a hand, a box or the like hides it; `edge_behind_m` and `edge_echo` of `LidarBoard`.
     """
     from scipy.spatial import cKDTree
 
@@ -509,8 +509,8 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
     beyond = strips.uv + strips.outwards * STRIP_M / 2
     for k, members in enumerate(cKDTree(view.uv).query_ball_point(beyond, STRIP_M / 2)):
         height_m = view.height_m[members]
-        # A plate ends where rays pass it. What stands before its border hides it; the floor, or a stand in
-        # its plane, leaves its border's place open.
+        # Rays that pass a plate show its border. An object before the border hides it; the floor, or a stand
+        # in its plane, leaves the border's place open.
         is_clear = (view.uv[members] - strips.uv[k]) @ strips.outwards[k] > _CLEAR_M
         is_there = height_m > -max(view.tolerance_m, _BEHIND_M)
         is_touched[k] = np.count_nonzero(is_there & is_clear) > _TOUCHED_SHARE * np.count_nonzero(is_clear)
@@ -523,10 +523,10 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
 
 
 def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
-    """Average the returns in cells of the plate; also the effective noise of one mean.
+    """Average the returns in cells of the plate; also return the effective noise of one mean.
 
-    Errors of neighbouring returns are alike: they follow the squares, glare and incidence. The scatter of the
-    means in coarse cells, which is nearly independent, tells that of fine ones as if they were independent.
+    Errors of neighbouring returns are alike: they follow the squares, glare and incidence. The means in
+    coarse cells are nearly independent; their scatter is scaled to the number of fine cells.
 
     Args:
         points: (N, 3) of the plate.

@@ -105,7 +105,7 @@ class EventCameraFile:
         """Yield packets of events, and frames, in order of time.
 
         Raises:
-            SourceError: after all that can be read, where the events' clock was set back.
+            SourceError: after the readable part, if the events' clock was set back.
         """
         parts: list[Iterable[Sample]] = [] if self._events is None else [self._events]
         losses = Losses()

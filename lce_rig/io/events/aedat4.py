@@ -46,7 +46,7 @@ class Aedat4Frame(NamedTuple):
 
 @contextmanager
 def _panics() -> Iterator[None]:
-    """Raise a ValueError in place of aedat's panic, which is no Exception: it cannot read what is damaged."""
+    """Turn aedat's panic on damaged data, which does not derive from Exception, into a ValueError."""
     try:
         yield
     except BaseException as error:
@@ -62,7 +62,7 @@ class Aedat4File:
         path: the file.
         streams: type ("events", "frame" and others) and size by number.
         serial: the camera's serial number, if a stream's source is named like DAVIS346_00000499, else "".
-        notes: what is unusual about the file.
+        notes: remarks on an unusual file, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ class Aedat4File:
             header = file.read(_MOST_HEADER_BYTES)
             if header.startswith(_MAGIC):
                 (n_bytes,) = struct.unpack_from("<I", header, len(_MAGIC))
-                # aedat ends the program where the header's text is none.
+                # aedat ends the program if the header is not text.
                 header[header.index(b"<dv") : len(_MAGIC) + 4 + n_bytes].decode()
             with _panics():
                 self.streams |= sorted(aedat.Decoder(path).id_to_stream().items())

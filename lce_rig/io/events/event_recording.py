@@ -18,10 +18,10 @@ from lce_rig.io.findings import worded
 
 NS_PER_US = 1000
 MAX_EVENT_PIXELS = 1 << 22
-"""Of one event camera: four times the largest on sale; a damaged file may declare more."""
-# Recorders with several threads, and readout that is not in order, mix timestamps by this much at most.
+"""Maximum pixels of one event camera: four times the largest on sale; a damaged file may declare more."""
+# Maximum disorder of timestamps from multi-threaded recorders and out-of-order readout, ns.
 REORDER_NS = 20_000_000
-# A whole stretch that is later by more than this is no damage: the clock was set.
+# Larger jumps count as a clock change, not as damaged timestamps, ns.
 _CLOCK_SET_NS = 1_000_000_000
 # More events off the sensor than this are another sensor's; fewer are damage.
 _MAX_OFF_SHARE = 0.01
@@ -43,9 +43,9 @@ class EventStream:
     """One file or topic of events.
 
     Attributes:
-        resolution_px: (width, height) that the file declares; None where it declares none.
-        notes: what was chosen or assumed on opening, in words.
-        serial: the camera's serial number; "" where the file does not name it.
+        resolution_px: (width, height) declared by the file, or None.
+        notes: choices and assumptions made on opening, in words.
+        serial: the camera's serial number, or "".
     """
 
     resolution_px: tuple[int, int] | None
@@ -93,7 +93,7 @@ class EventRecording:
         path: the file or folder.
         sensor: name of the camera.
         resolution_px: (width, height).
-        serial: the camera's serial number; "" where the file does not name it.
+        serial: the camera's serial number, or "".
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class EventRecording:
         return self.start_ns, max(int(stretch.t_ns[-1]) for stretch in self)
 
     def tie_to_host(self) -> None:
-        """Move timestamps that count from the sensor's start to the host's clock, where arrivals are known.
+        """Move timestamps that count from the sensor's start to the host's clock, if arrivals are known.
 
         The shift is the least difference among the first packets: the one that waited least.
         """

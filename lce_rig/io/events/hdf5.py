@@ -1,6 +1,6 @@
 """Events in HDF5: columns {t,x,y,p} of DSEC's group events or of the root, or Metavision's table CD/events.
 
-Times are microseconds, after t_offset where the file has one.
+Times are microseconds, after t_offset if the file has one.
 
 References:
     https://dsec.ifi.uzh.ch/data-format/
@@ -70,7 +70,7 @@ class Hdf5Events(EventStream):
 
 
 def _pixels(numbers: NDArray[Any]) -> NDArray[np.uint16]:
-    """Give columns or rows (N,) as 16 bits; numbers beyond stay off any sensor."""
+    """Convert columns or rows (N,) to 16 bits; larger numbers stay outside any sensor."""
     limit = 1 << 16
     return np.where((numbers >= 0) & (numbers < limit), numbers, limit - 1).astype(np.uint16)
 
@@ -106,7 +106,7 @@ def _find(group: Any, name: str, most_links: int = _MOST_LINKS) -> Any:
     """Return the object of a name, None if there is none; links inside the file are followed.
 
     Args:
-        group: where a relative name begins.
+        group: origin of a relative name.
         name: with slashes.
         most_links: soft links that may follow each other.
 

@@ -2,8 +2,8 @@
 
 A .raw file is lines of text, then words up to the end. Both encodings are state machines: some words set the
 time, the row (or column) or a base; others emit events from that state. A whole block is decoded at once:
-what a word sets is repeated up to the next word of its kind, and the words that hold the state at a block's
-end are put before the next block.
+a value set by a word is repeated up to the next word of its kind, and the words that hold the state at a
+block's end are put before the next block.
 
 References:
     https://docs.prophesee.ai/stable/data/file_formats/raw.html

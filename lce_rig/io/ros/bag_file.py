@@ -93,7 +93,7 @@ class BagFile:
                 for connection, log_ns, data in merge(*passes, key=lambda entry: int(entry[1])):
                     encoding = getattr(connection.ext, "serialization_format", "ros1")
                     data = bytes(data)
-                    # Without its metadata.yaml a bag does not say that each message is compressed; CDR begins
+                    # A bag without metadata.yaml does not state that each message is compressed; CDR begins
                     # with a zero.
                     if encoding != "ros1" and data.startswith(_ZSTD_MAGIC):
                         data = unpack(_zstd().ZstdDecompressor, data)
@@ -132,7 +132,7 @@ class BagFile:
 
 
 def kind_of(path: Path) -> str:
-    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
+    """Return the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
 
     The suffix is in lower case, and that of the bag for a compressed one or one that was not closed.
     """
@@ -153,10 +153,10 @@ def _bag_files(folder: Path) -> list[Path]:
 
 @contextmanager
 def _plain(file: Path) -> Iterator[Path]:
-    """Give a file as rosbags knows it: decompressed, its suffix in lower case.
+    """Yield a path of a file that rosbags can open: decompressed, with its suffix in lower case.
 
     Raises:
-        ValueError: it is no bag of its kind.
+        ValueError: not a bag, or damaged.
     """
     kind = kind_of(file)
     with TemporaryDirectory() as folder:
@@ -181,9 +181,9 @@ def _plain(file: Path) -> Iterator[Path]:
 
 @cache
 def _bound_rosbags() -> None:
-    """Let rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
+    """Make rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
 
-    Its tables of decompressors are replaced: they unpack whatever a chunk holds, before its size is checked.
+    The tables of decompressors are replaced, as theirs unpack a chunk before its size is checked.
     """
     lz4 = import_module("lz4.frame")
     from rosbags.rosbag1 import reader as ros1
@@ -232,7 +232,7 @@ def _type_of(connection: Any) -> str:
 
 
 def _repair(path: Path) -> str:
-    """Name the tool that restores the index of a bag whose recorder was killed."""
+    """Return the tool that restores the index of a bag whose recorder was killed."""
     commands = {".bag": f"rosbag reindex {path.name}", ".mcap": f"mcap recover {path.name}"}
     folder = (path if path.is_dir() else path.parent).resolve()
     command = commands.get(kind_of(path), f"ros2 bag reindex {folder.name}")

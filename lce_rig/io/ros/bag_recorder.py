@@ -33,7 +33,7 @@ _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def open_bag_writer(path: Path) -> Any:
-    """Begin a bag: ROS 1 where the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    """Begin a bag: ROS 1 if the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
     if path.suffix == ".bag":
         from rosbags.rosbag1 import Writer as Ros1Writer
 
@@ -67,7 +67,7 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
 
 
 def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryview:
-    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
+    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, if known, time.
 
     Args:
         scan: the scan; one without a timestamp gets 0, which readers take for none.
@@ -127,7 +127,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
     program was killed or the disk is full, lacks its index: `rosbag reindex` or `mcap recover` restores it.
 
     Attributes:
-        path: a ROS 1 bag where it ends in .bag, else the folder of a ROS 2 bag (mcap).
+        path: a ROS 1 bag if it ends in .bag, else the folder of a ROS 2 bag (mcap).
     """
 
     def __init__(self, path: Path, rig: Rig) -> None:
@@ -229,7 +229,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
-        """End the bag where a full disk or an interrupt tears it: nothing is written behind that."""
+        """Close the bag after a full disk or an interrupt; nothing is written after that."""
         if self._failure is not None:
             raise self._failure
         try:
@@ -237,7 +237,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         except BaseException as error:
             self._failure = _not_writable(self.path, error)
             with suppress(OSError):
-                # Of rosbags before 0.11 nothing closes a file without trying to write the index.
+                # rosbags before 0.11 cannot close a file without trying to write the index.
                 getattr(self._writer, "abort", self._writer.close)()
             if isinstance(error, OSError):
                 raise self._failure from error
@@ -245,7 +245,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
 
 
 def _not_writable(path: Path, error: BaseException) -> SourceError:
-    """Say that a recording cannot be written, and that what was written before is not lost."""
+    """Return the error for a failed write; its hint explains how to restore the data written so far."""
     return SourceError(
         f"{path} cannot be written: {getattr(error, 'strerror', '') or str(error) or type(error).__name__}",
         "Make room or record elsewhere; `rosbag reindex` or `mcap recover` restores what was recorded.",

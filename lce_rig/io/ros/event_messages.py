@@ -24,7 +24,7 @@ from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.messages import EventHead, decode_event_array, deserialize, header_stamp_ns
 
 ARRAY_TYPES = frozenset({"dvs_msgs/EventArray", "prophesee_event_msgs/EventArray"})
-# event_array_msgs is what event_camera_msgs was called before; the layout is the same.
+# event_array_msgs is the former name of event_camera_msgs, with the same layout.
 PACKET_TYPES = frozenset({"event_camera_msgs/EventPacket", "event_array_msgs/EventArray"})
 EVENT_TYPES = ARRAY_TYPES | PACKET_TYPES
 ENCODINGS = ("evt3", "libcaer_cmp", "trigger")
@@ -35,7 +35,7 @@ class EventPacket(NamedTuple):
 
     Attributes:
         number: of the message, as the driver counted them.
-        time_base_ns: origin of the timestamps inside; 0 where they count from the sensor's start.
+        time_base_ns: origin of the timestamps inside; 0 if they count from the sensor's start.
         encoding: one of `ENCODINGS`.
         words: (N,) uint16, the payload.
     """
@@ -87,7 +87,7 @@ class PacketDecoder:
         """Decode a packet.
 
         Raises:
-            ValueError: it is of no known encoding.
+            ValueError: its encoding is not supported.
         """
         events, base_ns = NO_EVENTS, 0
         if packet.encoding == "evt3":
@@ -111,7 +111,7 @@ class BagEvents(EventStream):
         Args:
             path: the bag.
             topic: None takes the only one with events.
-            bag: the same one, where it is open already.
+            bag: the same bag, if already open.
 
         Raises:
             SourceError: the bag cannot be read, or lacks the topic; the hint lists those that are there.

@@ -65,7 +65,7 @@ def typestore(is_ros1: bool) -> Any:
 
 
 def deserialize(message: RawMessage) -> Any:
-    """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses.
+    """Deserialise by ROS's own definitions; a bag's own may be missing, or unsupported by rosbags.
 
     Raises:
         ValueError: it is damaged.
@@ -84,7 +84,7 @@ def header_stamp_ns(content: Any) -> int:
     return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
 
 
-# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
+# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" for no conversion).
 _ENCODINGS = {
     "mono8": (1, 1, ""),
     "8uc1": (1, 1, ""),
@@ -182,7 +182,7 @@ _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 def decode_pointcloud2(message: Any) -> NDArray[Any]:
     """View a message's points by their names, row by row.
 
-    Field offsets, gaps between fields, gaps behind rows and byte order are as the message says.
+    Field offsets, gaps between fields, gaps after rows and byte order are taken from the message.
 
     Args:
         message: sensor_msgs/PointCloud2 of ROS 1 or 2.
@@ -191,7 +191,7 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
         Structured (height * width,); fields with a count of c > 1 have shape (c,).
 
     Raises:
-        ValueError: what in the message contradicts itself.
+        ValueError: the message contradicts itself; the text names the fields or sizes.
     """
     order = ">" if message.is_bigendian else "<"
     names: list[str] = []

@@ -22,7 +22,7 @@ from lce_rig.timing.clock_fit import fit_clock
 _MAX_DELAY_S = 2.0
 # Messages read to find the delays, in all and of each topic: raw images have megabytes.
 _N_PROBED, _N_OF_TOPIC = 500, 5
-# Larger drifts are no crystal's, but the scatter of few receipts.
+# Maximum drift of a quartz clock; a larger one comes from the scatter of a few receipts.
 _MAX_DRIFT = 200e-6
 # Standard deviation of the unknown part of a delay: transport, and processing by the driver.
 _DELAY_SIGMA_NS = 30_000_000.0

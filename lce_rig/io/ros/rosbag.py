@@ -41,9 +41,9 @@ class TopicDecoder:
     """Makes the images or scans of one topic from its messages, of a bag or live.
 
     Args:
-        target: the sensor it belongs to.
+        target: the sensor of the topic.
         settings: that sensor's block of the profile.
-        clock: from the timestamps' clock to the recorder's; None where they are one.
+        clock: from the timestamps' clock to the recorder's; None if they are the same.
 
     Attributes:
         n_yielded: samples so far.
@@ -68,7 +68,7 @@ class TopicDecoder:
         self._parts: list[Scan] = []
 
     def decode(self, message: RawMessage) -> list[Image | Scan]:
-        """Decode one message; empty, and counted, where it is damaged, sent twice or late."""
+        """Decode one message; a damaged, repeated or late one is counted and yields an empty list."""
         try:
             content, samples = deserialize(message), list[Image | Scan]()
             if message.msgtype in PACKET_TYPES:
@@ -98,7 +98,7 @@ class TopicDecoder:
         return ready
 
     def finish(self) -> list[Image | Scan]:
-        """Return the last scan where a revolution, or what accumulates, ends with the recording."""
+        """Return the last scan, if the recording ends during a revolution or an accumulation."""
         if self._parts:
             return [self._join()]
         last = self._packets.finish() if self._packets else None
@@ -110,7 +110,7 @@ class TopicDecoder:
         return lines if self._packets is None else lines + worded(self._packets.losses)
 
     def _assemble(self, content: Any) -> list[Image | Scan]:
-        """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
+        """Assemble the packets of a message; a scan ends at the rotor's cut, not with the message."""
         assert isinstance(self._settings, LidarSettings)  # as packets have no camera
         if self._packets is None:
             self._packets = Vlp16Stream(self._target.sensor, self._settings)
@@ -142,7 +142,7 @@ class TopicDecoder:
         return to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns, self.notes)
 
     def _join(self) -> Scan:
-        """Put the scans that have accumulated together."""
+        """Join the accumulated scans."""
         parts, self._parts = self._parts, []
         first_ns = parts[0].stamp_ns or 0
         if len(parts) == 1:

@@ -60,7 +60,7 @@ class Target:
         return IMAGE_TYPES | EVENT_TYPES if self.has_events else IMAGE_TYPES
 
     def stream(self, msgtype: str) -> Stream:
-        """Name the stream that messages of this type make."""
+        """Return the stream of messages of this type."""
         if self.channel is None:
             return Stream(self.sensor, "", "scans")
         return Stream(self.sensor, self.channel, "events" if msgtype in EVENT_TYPES else "images")
@@ -77,10 +77,10 @@ def choose_topics(
     Args:
         path: the bag, for messages.
         topics: (message type, number of messages) by topic.
-        notes: receives what was chosen.
+        notes: receives the choices, in words.
 
     Returns:
-        Sensor by topic; at least one camera channel and one LiDAR, one of the two in a part of a recording.
+        Sensor by topic: at least one camera channel and one LiDAR, or either one in a part of a recording.
 
     Raises:
         SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
@@ -123,7 +123,7 @@ def choose_topics(
         ]
         return fitting[0] if len(fitting) == 1 else ""
 
-    # The only topic of its kind is taken where the profile names none.
+    # If the profile names no topic, the only one of the right kind is used.
     for target, profile_topic in targets.items():
         topic = only(EVENT_TYPES)
         if topic and target.has_events and profile_topic is None and target not in chosen.values():
@@ -134,7 +134,7 @@ def choose_topics(
         if not of_kind or set(of_kind) & set(chosen.values()):
             continue
         target, profile_topic = of_kind[0], targets[of_kind[0]]
-        # Packets are read where a driver's point clouds of them were not recorded.
+        # Packets are read if the bag lacks the driver's point clouds of them.
         topic = only(target.types & CLOUD_TYPES) or only(target.types)
         if profile_topic is None and topic:
             take(target, topic, f", the only topic with {what}")
@@ -179,12 +179,12 @@ class SensorTopic:
         kind: "scans", "frames" or "events".
         n_messages: how many there are.
         rate_hz: from the receipt of the first to the bag's end; None for a single one.
-        frame: of the first message's header, "" without.
-        size_px: (width, height) of images and event arrays; None where they do not say.
-        n_rings: number of rings of a scan; None where points have none.
-        intrinsics: of its images, by its camera_info topic; None where there is no usable one.
-        note: the reason for which that is unusable, or what was done to fit it to the images.
-        cloud: the first point cloud of a topic of scans; None where it has packets.
+        frame: frame_id of the first message's header, or "".
+        size_px: (width, height) of images and event arrays; None if not stated.
+        n_rings: number of rings of a scan; None for points without a ring.
+        intrinsics: of its images, from its camera_info topic; None if missing or unusable.
+        note: the reason why the intrinsics are unusable, or the changes made to fit them to the images.
+        cloud: the first point cloud of a topic of scans; None for packets.
     """
 
     topic: str
@@ -216,7 +216,7 @@ def _namespace(topic: str) -> str:
 def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic]:
     """List the topics of a bag with images, events and point clouds, in the order of their names.
 
-    Depth images and images that are another topic's compressed ones are left out, and packets where there are
+    Depth images and compressed copies of another image topic are skipped; so are packets if the bag has
     point clouds.
 
     Args:
@@ -314,7 +314,7 @@ def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[Se
 
 
 def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
-    """Name the camera_info topic of an image's topic; None if there is none.
+    """Return the camera_info topic of an image's topic, or None.
 
     Drivers put it beside the image, also with the same beginning (left_camera_info for left_image), or below.
     """
@@ -328,7 +328,7 @@ def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
 
 
 def _stem(info: str) -> str:
-    """Return what stands before camera_info in the last part of a topic, as "left_"."""
+    """Return the part before camera_info in the last part of a topic, such as "left_"."""
     return info.rpartition("/")[2].partition("camera_info")[0]
 
 

@@ -30,7 +30,7 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PN
 
 
 def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
-    """Make a BGR copy of an image, enlarged by a whole factor to at least `min_width_px`.
+    """Copy an image to BGR, enlarged by a whole factor to at least `min_width_px`.
 
     Returns:
         The copy (H, W, 3) and the factor; a pixel at u lies at (u + 0.5) factor - 0.5 in it.
@@ -104,7 +104,7 @@ def draw_diamonds(
 def draw_line(
     picture: Picture, pixels: Array, colour: Colour, width_px: int = 2, casing: Colour | None = BLACK
 ) -> None:
-    """Draw a polyline through (N, 2) px, interrupted where a pixel is NaN, cased to be visible anywhere."""
+    """Draw a polyline through (N, 2) px, interrupted at NaN pixels, cased to be visible anywhere."""
     ends = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
     for part in np.split(pixels, ends):
         part = part[np.isfinite(part).all(axis=1)]

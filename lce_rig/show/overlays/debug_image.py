@@ -25,7 +25,7 @@ _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
 _DIM = 0.45
 _DPI, _WIDTH_IN, _PANE_IN = 100, 16, 5.9
-# Of a line that the board was found, and of a refusal with its action.
+# Height, inches: of a line that the board was found, and of a refusal with its action.
 _FOUND_IN, _REFUSED_IN = 0.5, 1.5
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"
@@ -44,7 +44,7 @@ def draw_debug(
     mismatch: Refusal | None = None,
     events: Events | None = None,
 ) -> Picture:
-    """Draw the camera's image beside three views of the scan, with cause and action where one is refused.
+    """Draw the camera's image beside three views of the scan, with cause and action for a refused one.
 
     Args:
         image: None if it could not be read.
@@ -136,7 +136,7 @@ def _draw_events(
     board: Board,
     intrinsics: Intrinsics,
 ) -> None:
-    """Draw recent events over the image, and in grey from where and to where the board was tracked."""
+    """Draw recent events over the image, and in grey the start and end of the board's track."""
     shown = recent_events(image, events)
     show_image(axes, (_DIM * image.pixels).astype(np.uint8))
     for is_kind, colour in ((shown.polarity, BRIGHTER), (~shown.polarity, DARKER)):
@@ -222,7 +222,7 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
 
 
 def _write(pane: Any, sensor: str, refusal: Refusal | None) -> None:
-    """State that a sensor found the board, or why not and what to do."""
+    """Write that a sensor found the board, or the refusal's cause and action."""
     state, colour = ("board found", _FOUND) if refusal is None else ("refused", _REFUSED)
     top: dict[str, Any] = {
         "xy": (0.02, 1),

@@ -305,7 +305,7 @@ def _draw(
 
 
 def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
-    """Put a camera in the first LiDAR's place that looks at the boards.
+    """Return a check with a camera in the first LiDAR's place, which looks at the boards.
 
     Args:
         check: of two LiDARs.

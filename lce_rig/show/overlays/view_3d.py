@@ -79,7 +79,7 @@ class CameraIn3D:
     T_cam_lidar: Array
 
     def frustum(self) -> tuple[Array, NDArray[np.int32]]:
-        """Give camera and corners (5, 3) of its field of view, frame lidar, and the lines (8, 2) between."""
+        """Return the camera and its field of view's corners (5, 3), frame lidar, and the lines (8, 2)."""
         rays = self.lens.unproject(outermost_pixels(self.lens))
         corners = np.concatenate([np.zeros((1, 3)), _FRUSTUM_M * rays])
         edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 4), (4, 3), (3, 1)]
@@ -90,7 +90,7 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
     """Open a window with a capture; N and P change to the next and the previous one. Returns when it closes.
 
     Raises:
-        SourceError: there is no display, or no window can be opened.
+        SourceError: the computer has no display, or no window can be opened.
     """
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -120,10 +120,10 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
 
 
 def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]) -> None:
-    """Write what the window would show first, as PNG or JPEG by the name of the file.
+    """Write the window's first view as PNG or JPEG, by the name of the file.
 
     Raises:
-        SourceError: nothing can be rendered here, or the name is of no such picture.
+        SourceError: nothing can be rendered here, or the name does not end in a known suffix.
         SessionError: the file cannot be written.
     """
     if path.suffix.lower() not in _PICTURES:
@@ -143,7 +143,7 @@ def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]
 
 
 def _open3d() -> Any:
-    # Where no desktop runs, a graphics library complains without it.
+    # Without a desktop, a graphics library complains if this variable is not set.
     os.environ.setdefault("XDG_RUNTIME_DIR", gettempdir())
     try:
         import open3d
@@ -189,7 +189,7 @@ def _look_from_behind(o3d: Any, window: Any, T_lidar_cam: Array) -> None:
     x = np.cross(z, up) if abs(z @ up) < 0.99 else T_lidar_cam[:3, 0]
     x /= np.linalg.norm(x)
     view = window.get_view_control()
-    # Else what lies beyond the cloud's own size is cut off.
+    # By default the view is clipped to the cloud's own size.
     view.set_constant_z_near(_NEAREST_M)
     view.set_constant_z_far(_FARTHEST_M)
     parameters = view.convert_to_pinhole_camera_parameters()

@@ -28,15 +28,15 @@ from lce_rig.core.geometry import Array
 
 Pixels = NDArray[np.uint8]
 
-#: Enough for a phone, and little enough for its radio.
+#: Maximum width of the image, px: sharp enough on a phone, small enough for its radio link.
 MAX_WIDTH_PX = 960
 _QUALITY = 75
-# A collection runs for hours; the page shows the last of its messages.
+# Messages on the page: a collection runs for hours, only the last ones are shown.
 _MAX_LOG = 50
 
 
 def to_json(state: LiveState, *, has_picture: bool) -> str:
-    """Write a state, without its image, for the page; what is not known is null.
+    """Write a state, without its image, as JSON for the page; unknown values are null.
 
     Args:
         state: the state.
@@ -58,7 +58,7 @@ def to_json(state: LiveState, *, has_picture: bool) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Turn records into what JSON knows."""
+    """Convert records and tuples to JSON types; numbers that are not finite become None."""
     if isinstance(value, Coverage):
         value = asdict(value)
     elif isinstance(value, (StreamState, Cue)):
@@ -71,7 +71,7 @@ def _plain(value: Any) -> Any:
 
 
 def beat(age_s: float | None) -> str:
-    """Write that nothing is new, and for how long; None where nothing has come yet."""
+    """Write the message for a page without news: the age of the last state, or None before the first."""
     return json.dumps({"beat": True, "age_s": None if age_s is None else round(age_s, 1)})
 
 
@@ -125,16 +125,16 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
     return [point if is_point else None for point, is_point in zip(rounded, is_seen, strict=True)]
 
 
-# A person who taps faster than the collection listens wants one thing.
+# Maximum requests in the queue: repeated quick taps mean one request.
 _MOST_ASKED = 8
 # Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
 _LOOK_S = 0.03
-#: Between two updates.
+#: Time between two updates, s.
 PERIOD_S = 0.1
-#: Without news the page gets a message this often, and so knows that it is still connected.
+#: Time without news after which the page gets a message, s, so that it sees the connection is alive.
 BEAT_S = 1.0
 MAX_MESSAGE_BYTES = 256
-#: A page that answers nothing for so long sleeps, or is out of range; it connects again when it wakes.
+#: Time without an answer after which a page sleeps or is out of range, s; it reconnects when it wakes.
 ANSWER_S = 5.0
 _GOODBYE_S = 0.5
 _COOKIE = "lce_rig_preview"
@@ -158,20 +158,20 @@ class Feed:
         self._asked: deque[TakeBack] = deque(maxlen=_MOST_ASKED)
 
     def publish(self, state: LiveState) -> None:
-        """Put a state in; from one thread at a time. It is a single assignment, so it never blocks."""
+        """Store a state; call from one thread only. It is a single assignment, so it never blocks."""
         number = 1 if self._newest is None else self._newest[0] + 1
         self._newest = (number, time.monotonic(), state)
 
     def ask(self, asked: TakeBack) -> None:
-        """Put a request of a page in, for the thread that collects; the oldest make way."""
+        """Queue a request of a page for the thread that collects; the oldest are dropped."""
         self._asked.append(asked)
 
     def asked(self) -> TakeBack | None:
-        """Take the oldest request; None where nothing is asked for."""
+        """Remove and return the oldest request; None if the queue is empty."""
         return self._asked.popleft() if self._asked else None
 
     def newest(self) -> tuple[int, LiveState] | None:
-        """Give the newest state and its running number, from 1; None before one has come."""
+        """Return the newest state and its running number, from 1; None before the first."""
         newest = self._newest
         return None if newest is None else (newest[0], newest[2])
 
@@ -193,7 +193,7 @@ class Feed:
 class Viewer:
     """Feeds one open page with the newest state as fast as it can follow, and no faster.
 
-    The page answers each message once it is on the screen, and says whether it is looked at: only then are
+    The page answers each message once it is on the screen, and reports whether it is visible; only then are
     images sent. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
     from it.
     """
@@ -225,13 +225,13 @@ class Viewer:
             await self._line.close(code=1008, message=b"only answers and requests are read")
 
     async def close(self) -> None:
-        """Let the page have the last state, for a moment, and close the connection."""
+        """Wait briefly until the page has the last state, and close the connection."""
         for _ in range(10):
             newest = self._feed.newest()
             if newest is None or newest[0] <= self._delivered:
                 break
             await asyncio.sleep(_GOODBYE_S / 10)
-        # Closing waits until the page has taken what was sent, and a stuck one never does.
+        # Closing waits until the page has read all messages; a stuck page never does.
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), _GOODBYE_S)
 
@@ -245,7 +245,7 @@ class Viewer:
             await self._line.send_bytes(jpeg)
 
     async def _read_answer(self) -> bool:
-        """Read up to {"visible": bool}, and requests {"take_back": name}; False where it is neither."""
+        """Read up to {"visible": bool}, and requests {"take_back": name}; False for anything else."""
         while True:
             received = await self._line.receive(ANSWER_S)
             try:
@@ -255,7 +255,7 @@ class Viewer:
             match said:
                 case {"visible": bool(is_looked_at)}:
                     if is_looked_at and not self._is_looked_at:
-                        # What was sent meanwhile had no image.
+                        # The states sent meanwhile had no image.
                         self._pixels, self._state = None, 0
                     self._is_looked_at = is_looked_at
                     return True
@@ -292,7 +292,7 @@ class Pages:
         return app
 
     async def close(self) -> None:
-        """Let the pages have the last state, and close them."""
+        """Send the pages the last state, and close them."""
         closing = (viewer.close() for viewer in self._viewers)
         await asyncio.gather(*closing, return_exceptions=True)
         self.encoder.close()
@@ -300,13 +300,13 @@ class Pages:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         tokens = (request.query.get("token", ""), request.cookies.get(self._cookie(request), ""))
-        # In constant time, so that a wrong token does not tell how much of it is right.
+        # In constant time, so that the response time does not reveal the correct part of a wrong token.
         if not any(
             hmac.compare_digest(text.encode(errors="replace"), self._token.encode()) for text in tokens
         ):
             text = "This page needs the whole link that lce-rig shows, with its token.\n"
             answer = web.Response(status=403, text=text)
-            # Without the connection, strangers ask no faster than they are accepted.
+            # Closing the connection limits strangers to the rate of new connections.
             answer.force_close()
             return answer
         origin = request.headers.get("Origin", f"http://{request.host}")

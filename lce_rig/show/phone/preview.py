@@ -30,7 +30,7 @@ _INTERFACE = struct.Struct("16s20s")
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Take an address apart: "host:port", "host" or "port"; this computer alone and port 8765 by default.
+    """Parse an address: "host:port", "host" or "port"; this computer alone and port 8765 by default.
 
     Raises:
         UsageError: it is none of these.
@@ -59,8 +59,8 @@ def listen(host: str, port: int) -> socket.socket:
 def links(opened: socket.socket, token: str) -> tuple[str, ...]:
     """Build the links under which a page can be opened, the likeliest first.
 
-    Where the socket listens on all addresses, there is one for each IPv4 address of this computer: which of
-    its networks a phone is in cannot be known.
+    If the socket listens on all addresses, there is one for each IPv4 address of this computer, as the phone
+    may be in any of its networks.
     """
     host, port = opened.getsockname()
     hosts = [host]
@@ -90,11 +90,11 @@ def _network_addresses() -> list[str]:
 # 72 bits: beyond guessing, and can still be typed into a phone.
 _TOKEN_BYTES = 9
 _STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
-# For the rest of a request that was answered before its end.
+# Time to read the rest of a request that was answered before its end, s.
 _LINGERING_S = 1.0
 # asyncio sets up a connection in the three turns of its loop after it has accepted it.
 _TURNS_TO_SET_UP = 4
-# What strangers send wrongly must not reach the terminal that shows the collection.
+# Malformed requests from strangers must not be logged on the terminal that shows the collection.
 _SILENT = logging.Logger("preview", logging.CRITICAL + 1)
 
 
@@ -144,7 +144,7 @@ class Preview:
         self._feed.publish(state)
 
     def asked(self) -> TakeBack | None:
-        """Take the oldest request of a page; None where nothing is asked for."""
+        """Remove and return the oldest request of a page; None if the queue is empty."""
         return self._feed.asked()
 
     @property
@@ -153,7 +153,7 @@ class Preview:
         return 0 if self._pages is None else self._pages.encoder.n_encoded
 
     def close(self) -> None:
-        """Let open pages have the last state, and end."""
+        """Send open pages the last state, and stop."""
         if self._thread is None or self._loop is None or self._stop is None:
             return
         if self._thread.is_alive():

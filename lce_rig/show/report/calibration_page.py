@@ -33,9 +33,9 @@ from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.tables import result_tables, rig_table, scene_words
 
 _LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
-# The statement names the expected error at this distance.
+# Distance at which the report states the expected error, m.
 _USUAL_M = 10.0
-# Captures with more than this many times the median residual are marked. A page holds so many pictures.
+# Ratio to the median residual from which captures are marked; maximum number of images on a page.
 _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 
@@ -79,7 +79,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
 
 
 def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) -> list[str]:
-    """Name a capture's overlays as `verify` of the session does."""
+    """Return the names of a capture's overlays, as written by `verify` of the session."""
     return [
         "/".join([folder, *([Pair(c.camera, channel, c.lidar).folder_name] if has_folders else []), name])
         for channel in c.channels or ("",)
@@ -180,7 +180,7 @@ def _statement(c: Calibration) -> str:
 
 
 def _reasons(c: Calibration) -> list[tuple[str, str]]:
-    """List severity and text of the findings: causes, what follows from them, notes."""
+    """List severity and text of the findings: causes, consequences, notes."""
     rows = []
     for finding in c.findings:
         if finding.follows:
@@ -219,21 +219,21 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
 
 
 _MOST_PX, _QUALITY, _OUTLINE_BGR = 320, 60, (0, 140, 255)
-# Events of this long make a picture in which the board's edges can be seen.
+# Length of the events in a picture, ns: enough to show the board's edges.
 _EVENTS_NS = 20_000_000
 
 
 def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics) -> str:
-    """Draw a capture's image with the board's outline; raw events where it holds no image.
+    """Draw a capture's image with the board's outline; raw events if the capture has no image.
 
     Args:
         capture: with the data.
-        c: the result, whose channels are looked at in their order.
+        c: the result; its channels are tried in their order.
         board: of the outline.
         lens: of the camera.
 
     Returns:
-        A data URI; "" where the capture holds no picture, or a damaged one.
+        A data URI; "" if the capture has neither image nor events, or damaged ones.
     """
     observation = c.observations.get(capture.name)
     outline, stamp_ns = np.empty((0, 2)), None

@@ -28,11 +28,11 @@ PAGE_HELP = "   p QR code"
 
 @dataclass
 class Controls:
-    """What the user has asked for.
+    """Requests of the user, from keys and signals.
 
     Attributes:
         is_interactive: whether keys can be pressed at all.
-        signal: that was received, by its number; None for none.
+        signal: number of the signal received, or None.
         wants_code: whether the page's QR code is wanted on the screen.
     """
 
@@ -41,7 +41,7 @@ class Controls:
     wants_code: bool = False
 
     def __call__(self) -> Key | TakeBack | None:
-        """Give the next thing that is asked for; None where nothing is."""
+        """Return the next request, or None."""
         if self.signal is not None:
             return "stop"
         if self.is_interactive and select.select([sys.stdin], [], [], 0)[0]:
@@ -53,13 +53,13 @@ class Controls:
 
 @contextmanager
 def controls() -> Iterator[Controls]:
-    """Read single keys where there is a terminal, and take signals as requests to stop."""
+    """Read single keys if stdin is a terminal, and take signals as requests to stop."""
     is_interactive = sys.stdin.isatty()
     asked = Controls(is_interactive)
 
     def take(number: int, _frame: Any) -> None:
         if asked.signal is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt  # Who asks twice is in a hurry.
+            raise KeyboardInterrupt  # The second Ctrl-C stops at once.
         asked.signal = number
 
     before = {

@@ -72,11 +72,11 @@ _STYLES: dict[Phase, str] = {
     "lost": "white on red",
     "ended": "white on grey30",
 }
-# Told apart by their number; rung too fast, they would be one.
+# Minimum time between rings, s: faster ones sound like one, and only their number differs.
 _BELL_EVERY_S = 0.2
 _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
 _HEIGHT, _WIDTH = 24, 80
-# Bars and figures; the drawing stands beside them.
+# Width of bars and figures, characters; the drawing is beside them.
 _SIDE_WIDTH = 40
 # Written small in the headline, too: 8 M would be something else.
 _UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
@@ -100,12 +100,12 @@ def open_view(
     links: tuple[str, ...] = (),
     wants_code: Callable[[], bool] = lambda: False,
 ) -> Iterator[View]:
-    """Open a screen where stderr is a terminal that can draw one, else, or where wanted, plain lines.
+    """Open a full screen if stderr is a terminal that can draw one, else plain lines.
 
     Args:
-        is_plain: lines are wanted.
+        is_plain: print plain lines in any case.
         has_keys: whether keys can be pressed.
-        links: of the page, the likeliest first; a screen covers what was printed before it.
+        links: of the page, the likeliest first; a screen covers the links printed earlier.
         wants_code: asked whether to show the page's QR code in place of the guidance.
     """
     bell = Bell(is_silent=not sys.stderr.isatty())
@@ -129,7 +129,7 @@ def open_view(
 
 
 class Bell:
-    """Rings the terminal's bell for what is new in states: once for a capture, twice for a refused one."""
+    """Rings the terminal's bell for new cues in states: once for a capture, twice for a refused one."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class PlainView:
         self._n_explained = 0
 
     def show(self, state: LiveState) -> None:
-        """Print what is new."""
+        """Print the news since the last state."""
         self._bell.take(state)
         for note in state.notes:
             if note not in self._notes:
@@ -222,7 +222,7 @@ class ScreenView:
 
 
 def render_code(link: str, state: LiveState, *, height: int = _HEIGHT, width: int = _WIDTH) -> Any:
-    """Lay out a page's QR code with its link and the headline; None if there is no room, or no use."""
+    """Lay out a page's QR code with its link and the headline; None if they do not fit, or without a code."""
     from rich.console import Group
     from rich.text import Text
 
@@ -257,10 +257,10 @@ def render(
     height: int = _HEIGHT,
     width: int = _WIDTH,
 ) -> Any:
-    """Lay a state out for a terminal; of the page's links the likeliest is shown.
+    """Lay a state out for a terminal; only the likeliest of the page's links is shown.
 
-    Sentences wrap. What is left over goes to messages and to a larger drawing; where lines are short, the
-    banner's edges and then the coverage bars make way.
+    Sentences wrap. The remaining room goes to messages and to a larger drawing; on a short terminal, the
+    banner's edges and then the coverage bars are dropped.
     """
     from rich.console import Console, Group
     from rich.padding import Padding
@@ -289,7 +289,7 @@ def render(
         headline += f"   {state.hold_s:.1f} s"
     banner = Text(headline, style="bold", justify="center")
     above = [Text(state.detail or " ", style="italic"), _stream_table(state.streams)]
-    # A link that is cut is none: it wraps where it is too long.
+    # A truncated link is useless, so long ones wrap.
     below = [Text(f"page: {link}", overflow="fold") for link in links[:1]]
     if has_keys:
         keys = HELP + (PAGE_HELP if links and qr_lines(links[0]) else "")
@@ -301,7 +301,7 @@ def render(
     n_free = height - n_lines([title, Padding(banner, (0, 2)), *above, *below])
     n_newest, n_beside = n_lines([newest]), n_lines(side, _SIDE_WIDTH)
     n_room = n_free - n_newest - n_lines(notes[:1])
-    # The lines of a prediction are kept free until there is one: the drawing beside them keeps its size.
+    # The lines of a prediction are kept free before there is one, so that the drawing keeps its size.
     n_blank = max(min(n_room, len(_BARS) + 4) - n_beside, 0)
     side, n_beside = side + [Text(" ")] * n_blank, n_beside + n_blank
     edge = 1 if n_room - n_beside >= 2 else 0
@@ -309,9 +309,9 @@ def render(
         side = side[len(_BARS) :]
         n_beside = n_lines(side, _SIDE_WIDTH)
     n_room = n_free - 2 * edge
-    if height > _HEIGHT:  # of one size whatever messages come
+    if height > _HEIGHT:  # the same size for any number of messages
         n_beside = max(min(height - 14, n_room - 3), n_beside)
-    # The newest message, notes, then older messages, as many as there is room for.
+    # The newest message, notes, then older messages, up to the free lines.
     n_left = n_room - n_beside - n_newest
     kept = []
     for part in [*notes, *older]:
@@ -329,7 +329,7 @@ def render(
 
 
 def _stream_table(streams: tuple[StreamState, ...]) -> Any:
-    """Lay the streams out: name, rate, losses, and figures of the board or what is wrong."""
+    """Lay the streams out: name, rate, losses, and figures of the board or the fault."""
     from rich.table import Table
     from rich.text import Text
 
@@ -351,7 +351,7 @@ def _stream_table(streams: tuple[StreamState, ...]) -> Any:
 
 
 def _progress(state: LiveState) -> list[Any]:
-    """Show coverage as bars, predicted standard deviations against their targets, and what is left to do."""
+    """Show coverage as bars, predicted standard deviations against their targets, and remaining work."""
     from rich.text import Text
 
     lines: list[Any] = []
@@ -375,7 +375,7 @@ def _progress(state: LiveState) -> list[Any]:
 
 
 def _drawing(state: LiveState, most: tuple[int, int]) -> Any:
-    """Draw where the board is (dotted) and where it should be, with columns and lines at most."""
+    """Draw the board's present outline (dotted) and its wanted one; `most` is (columns, lines) at most."""
     from rich.text import Text
 
     drawing = state.drawing
@@ -383,7 +383,7 @@ def _drawing(state: LiveState, most: tuple[int, int]) -> Any:
         return None
     height, width = drawing.pixels.shape[:2]
     rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, most)
-    # Guidance goes from camera to camera: whose image this is stands in its border.
+    # Guidance switches between cameras, so the border names the camera.
     name = f" {drawing.camera} "[: len(rows[0]) - 3]
     rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
