@@ -49,7 +49,7 @@ def error_m(captures):
     )
 
 
-def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
+def test_background_person_is_compensated():
     plain = simulate(20, 3)
     captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     found = fit_extrinsic(captures, BOARD, OPTIONS)
@@ -63,7 +63,7 @@ def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
     assert corrected < 0.6 * as_measured
 
 
-def test_what_walls_behind_the_board_take_from_its_edges_is_found_and_made_good():
+def test_background_wall_is_compensated():
     rng = np.random.default_rng(0)
     captures = [lit(c, rng) for c in simulate(20, 5)]
     found = fit_extrinsic(captures, BOARD, OPTIONS)
