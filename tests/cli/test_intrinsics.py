@@ -81,7 +81,7 @@ def test_too_few_captures_exit_with_6(lce_rig, session):
     assert "3 of 3 captures" in outcome.err
 
 
-def test_a_lidars_errors_are_printed_and_written_to_a_profile_or_refused(lce_rig, simulated, few, tmp_path):
+def test_lidar_intrinsics_saved_or_refused(lce_rig, simulated, few, tmp_path):
     refused = lce_rig("lidar-intrinsics", few)
     assert refused.code == 6
     new = tmp_path / "new.yaml"
