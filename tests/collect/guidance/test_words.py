@@ -87,7 +87,7 @@ def test_following_every_word_leads_there():
         assert is_there(VIEW, present, wanted)
 
 
-def test_the_board_is_not_there_while_something_is_to_be_done_by_far():
+def test_is_there_distant_pose_is_false():
     held = build_pose(VIEW, HERE)
     assert not is_there(VIEW, build_pose(VIEW, replace(HERE, tilt_deg=25.0)), held)
     assert not is_there(VIEW, build_pose(VIEW, replace(HERE, right_m=0.4)), held)
