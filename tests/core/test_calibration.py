@@ -217,7 +217,7 @@ def test_files_of_earlier_versions_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(("before", "now"), [("agrees", "unchanged"), ("contradicts", "changed")])
-def test_axes_of_the_scene_are_read_as_earlier_versions_called_them(tmp_path, before, now):
+def test_result_earlier_axis_names_are_read(tmp_path, before, now):
     def as_before(document):
         document["pairs"][0]["scene"]["axes"][0] |= {"state": before, "unit": "deg"}
 

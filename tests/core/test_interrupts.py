@@ -74,7 +74,8 @@ def test_who_presses_twice_does_not_wait():
     assert said == INTERRUPTED + "\n"
 
 
-def test_what_must_be_written_first_has_longer_but_not_at_the_second_press():
+def test_interrupt_second_press_exits():
+    """The first press leaves time to write."""
     busy = """
     import signal
     asked = []
