@@ -36,7 +36,7 @@ def watched(calibration: Calibration, seed: int) -> BoardDrift:
     return found
 
 
-def test_a_rotation_that_a_translation_hides_axis_by_axis_is_seen_jointly() -> None:
+def test_board_drift_hidden_rotation_is_seen() -> None:
     hidden = np.array([0, 0.05, 0, np.radians(1.01), 0, 0])
     for seed in range(3):
         board = watched(deployed(hidden), seed)
@@ -62,7 +62,7 @@ def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
 
 
 @pytest.mark.parametrize(("board_deg", "state"), [(0.10, "unknown"), (0.45, "changed")])
-def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float, state: State) -> None:
+def test_boards_refute_or_confirm_the_scene(board_deg: float, state: State) -> None:
     calibration = deployed(np.zeros(6))
     scene = axes({"rotation_z": ("changed", 0.54)})
     drift = Drift(scene, (), T_FORWARD, {}, 15, 4000)

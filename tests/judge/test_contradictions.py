@@ -12,7 +12,7 @@ def test_one_board_that_the_lidar_missed_is_no_contradiction():
     assert contradictions(GOOD, RIG, n_elsewhere=1, n_seen=30) == ()
 
 
-def test_many_boards_that_are_not_where_the_extrinsic_puts_them_are_one():
+def test_boards_elsewhere_are_one_finding():
     (doubt,) = contradictions(GOOD, RIG, n_elsewhere=10, n_seen=30)
     assert (doubt.code, doubt.figures) == ("verify.elsewhere", {"n_elsewhere": 10, "n_captures": 30})
 
