@@ -12,7 +12,7 @@ from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, shippe
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
 
-def test_the_shipped_profiles_are_the_papers_one_per_lidar_and_several():
+def test_shipped_profiles_are_as_listed():
     of_papers, of_lidars = {"rlfs", "rles", "sss"}, {"os1_64", "os0_128", "xt32", "hdl32e", "mid360"}
     assert set(shipped_profiles()) == of_papers | of_lidars | {"two_cameras", "four_sensors"}
     assert all(load_rig(name).name == name for name in shipped_profiles())
