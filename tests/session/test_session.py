@@ -36,7 +36,7 @@ def test_times_of_any_size_survive(tmp_path, rig, offsets):
     assert session.captures[0].scan("lidar").offset_ns.tolist() == offsets
 
 
-def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig, samples):
+def test_other_rig_names_differing_keys(tmp_path, rig, samples):
     with Session.create(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
     text = dump_rig(rig).replace("square_m: 0.07", "square_m: 0.06")
@@ -63,7 +63,7 @@ def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, sam
     assert Session.open(tmp_path / "s").rig.cameras["cam"].driver.device == "/dev/video7"
 
 
-def test_a_session_that_holds_nothing_can_be_discarded_and_no_other(tmp_path, rig, samples):
+def test_discard_only_an_empty_session(tmp_path, rig, samples):
     for name in ("empty", "captured", "noted"):
         with Session.create(tmp_path / name, rig) as session:
             if name == "captured":
