@@ -44,7 +44,7 @@ def test_the_link_opens_the_page_and_its_cookie_all_it_loads():
         assert watcher.next_state()[0]["n_captures"] == 7
 
 
-def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(preview):
+def test_pages_load_nothing_and_are_not_kept(preview):
     with Watcher(preview.urls[0]) as watcher:
         for path in ("", "page.js", "nothing-here"):
             headers = watcher.get(path)[1]
