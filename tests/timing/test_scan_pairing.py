@@ -45,12 +45,12 @@ def test_scans_without_times_last_as_long_as_the_profile_says(rig):
     assert pairs([scan(1000, has_times=False), image(1000)], rig)[0] == [(1000, [1000])]
 
 
-def test_pictures_that_come_much_later_than_their_scan_still_find_it(rig):
+def test_pairing_late_images_find_their_scan(rig):
     samples = [scan(1000), scan(1100), scan(1200), image(1000), image(1100), image(1200)]
     assert [images for _, images in pairs(samples, rig)[0]] == [[1000], [1100], [1200]]
 
 
-def test_what_lies_outside_the_tolerance_is_left_alone_and_measured(rig):
+def test_pairing_outside_limit_is_measured(rig):
     found, losses = pairs([image(900), scan(1000), image(1080)], rig)
     assert found == [] and alone(losses) == (1, 0.08)
 
