@@ -31,7 +31,7 @@ def somewhere_else(seed, T_cam_lidar=T_FORWARD):
         ("on its side", (0, 20, 95)),
     ],
 )
-def test_the_extrinsic_is_found_however_the_lidar_is_mounted(mounting, turn_deg):
+def test_consensus_any_mounting_is_found(mounting, turn_deg):
     R_turn = exp_so3(np.radians(np.array(turn_deg, dtype=float)))
     T = pose(T_FORWARD[:3, :3] @ R_turn.T, np.array([0.3, -0.2, 0.15]))
     captures = simulate(10, seed=3, T_cam_lidar=T)

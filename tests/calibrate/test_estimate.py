@@ -163,7 +163,7 @@ def test_error_to_reference_angle_distance():
     np.testing.assert_allclose(error_to_reference(T, T_FORWARD), (0.3, 0.005), rtol=1e-9)
 
 
-def test_noise_of_the_range_is_what_the_plane_residual_shows():
+def test_plane_residual_shows_range_noise():
     captures = simulate(6, 0, Scenario(range_sigma_m=0.02, corner_sigma_px=0.0))
     residuals = [capture_residual(T_FORWARD, item, BOARD) for item in captures]
     rms_m = np.sqrt(np.mean([r.plane_rms_m**2 for r in residuals]))
@@ -171,7 +171,8 @@ def test_noise_of_the_range_is_what_the_plane_residual_shows():
     assert 0.014 < rms_m < 0.0205
 
 
-def test_a_capture_without_ring_ends_does_not_spoil_the_mean():
+def test_residuals_without_ring_ends_are_nan():
+    """The mean is that of the captures with ring ends."""
     item = simulate(1, 0)[0]
     bare = replace(
         item,

@@ -54,7 +54,7 @@ def test_lidar_errors_match_deviations():
 
 
 @pytest.mark.long
-def test_errors_known_from_other_sessions_sharpen_a_later_one():
+def test_known_laser_errors_sharpen_estimate():
     known = measured(3).found
     later = observations(3, slice(16, 24), T_FORWARD)
     plain, helped = (

@@ -162,7 +162,7 @@ def test_motion_single_channel_is_unchanged():
     assert result.channel_difference is None
 
 
-def test_pictures_that_read_the_board_upside_down_are_turned(followed):
+def test_motion_upside_down_image_is_turned(followed):
     captures, right = followed[0]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     flipped = [

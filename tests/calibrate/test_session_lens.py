@@ -89,7 +89,7 @@ def test_the_lidar_does_not_move_the_lens(captures):
 
 
 @pytest.mark.parametrize("method", ["ml", "paper"])
-def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
+def test_lens_change_moves_extrinsics(captures, method):
     estimate = fit_extrinsic(captures, BOARD, replace(of_profile(ROUGH), method=method))
     lens = estimate.lens
     (by_lens,) = (each for each in estimate.sensitivities if each.source == "intrinsics")

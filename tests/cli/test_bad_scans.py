@@ -147,7 +147,7 @@ def test_a_box_that_touches_the_plate_gives_no_wrong_result(lce_rig, spoil, deep
 
 
 @pytest.mark.long
-def test_a_board_partly_outside_the_field_of_view_is_refused(lce_rig, spoil):
+def test_board_half_out_of_view_is_refused(lce_rig, spoil):
     def cut(scan, T):
         azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
         return scan.select(np.flatnonzero(azimuth < np.arctan2(T[1, 3], T[0, 3]) + 0.04))

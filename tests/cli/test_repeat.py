@@ -121,7 +121,7 @@ def test_repeat_failed_calibration_is_error(lce_rig, made):
     assert found["figures"] == {"camera": "davis", "lidar": "lidar"}
 
 
-def test_sensors_of_one_session_only_leave_nothing_to_compare(lce_rig, made):
+def test_repeat_no_common_sensor_is_refused(lce_rig, made):
     outcome = lce_rig("repeat", made("monday", [0] * 6), made("rear", [0] * 6, lidar="rear"))
     assert outcome.code == 4
     assert "monday:" in outcome.err and "rear:" in outcome.err

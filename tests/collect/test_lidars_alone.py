@@ -84,7 +84,7 @@ def test_collect_still_plate_gives_a_capture(tmp_path: Path, rig: Rig) -> None:
     assert not again.captured and again.n_known == 2
 
 
-def test_python_reads_two_recordings_each_by_its_own_options(tmp_path: Path, rig: Rig) -> None:
+def test_collect_from_takes_options_per_bag(tmp_path: Path, rig: Rig) -> None:
     scans, names = recorded([place(2.5, 15, 45, 20)] * 8).samples_read, ("left", "right")
     bags, sources = [], []
     for name in names:

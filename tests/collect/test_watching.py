@@ -109,7 +109,7 @@ def test_live_and_offline_take_the_same_boards():
                 assert ("lidar" in detection.lidars) != isinstance(scan, Refusal)
 
 
-def test_a_moment_is_confirmed_by_the_search_that_check_makes():
+def test_confirm_moment_searches_thoroughly():
     watcher = BoardTracker(rig())
     for time_s in (0.0, 0.1, 0.2):
         detection = see(watcher, 0, time_s)

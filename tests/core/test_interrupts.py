@@ -52,7 +52,7 @@ def running(busy):
 
 
 @pytest.mark.parametrize("busy", BUSY.values(), ids=BUSY)
-def test_whatever_is_going_on_ends_after_a_grace_in_one_line(busy):
+def test_interrupt_busy_ends_after_grace(busy):
     with running(busy) as process:
         pressed_s = time.monotonic()
         process.send_signal(signal.SIGINT)

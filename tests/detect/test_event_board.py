@@ -103,7 +103,7 @@ def test_events_are_counted_on_the_board_only(stream, detection):
         (lambda _: join(noise(0.3), lamps(100)), "image.flicker", {}),
     ],
 )
-def test_events_that_show_no_board_are_refused_by_their_cause(stream, events, code, figures):
+def test_event_board_none_names_the_cause(stream, events, code, figures):
     board = find(events(stream))[1]
     assert board.code == code
     assert {name: board.figures[name] for name in figures} == figures

@@ -49,7 +49,8 @@ CASES = [
 
 
 @pytest.mark.parametrize(("board", "camera", "T"), CASES)
-def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(board, camera, T):
+def test_image_board_corners_are_accurate(board, camera, T):
+    """To 0.05 px RMS."""
     result = found(draw(board, camera, T), board, camera)
     truth, _ = camera.project(transform(T, board.corners()))
     error = result.corners_px - truth
@@ -96,7 +97,7 @@ SHIFTS = [(n, to) for n in (0.2, 0.6, 1.0, 1.4, 2.0) for to in ((1.0, 0.0), (0.0
 
 @pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
 @pytest.mark.parametrize(("n_squares", "direction"), [(0.0, (1.0, 0.0)), *SHIFTS])
-def test_a_board_that_is_followed_is_found_as_if_it_were_not(board, n_squares, direction):
+def test_image_board_followed_equals_search(board, n_squares, direction):
     first = _first_of_following(board)
     shift = n_squares * board.square_m * np.array(direction)
     T_moved = FOLLOWED_FROM.copy()
@@ -129,7 +130,7 @@ def test_image_board_quick_search_follows(camera, z_m, turn_deg, closer):
     assert np.abs(quick.corners_px - whole.corners_px).max() < 0.15
 
 
-def test_a_board_that_went_far_is_found_in_the_whole_picture():
+def test_image_board_moved_far_is_found():
     pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
     before = found(draw(SYMMETRIC, WIDE, looking(25, 80, 40, (-0.7, 0, 2.2))), SYMMETRIC, WIDE)
     result = find_image_board(picture(pixels), SYMMETRIC, WIDE, last=before)

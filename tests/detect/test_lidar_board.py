@@ -197,7 +197,7 @@ def test_ring_ends_lie_within_a_step():
         assert azimuth[ends & (board.edge_side > 0)] > azimuth[ends & (board.edge_side < 0)]
 
 
-def test_normal_edges_and_size_are_unbiased_over_many_boards():
+def test_lidar_board_is_unbiased():
     errors, residuals, sizes, sigmas = [], [], [], []
     rng = np.random.default_rng(5)
     for seed in range(40):
@@ -263,7 +263,7 @@ def test_two_rings_are_refused_with_the_way_to_go():
     ],
     ids=["none", "of another size", "a part of a larger surface"],
 )
-def test_a_room_without_the_board_is_refused_by_what_is_there(shapes, code, figures):
+def test_lidar_board_none_names_the_cause(shapes, code, figures):
     refusal = find(cast([*shapes, *ROOM], sigma_m=0.01))
     assert isinstance(refusal, Refusal) and refusal.code == code
     assert {name: refusal.figures[name] for name in figures} == figures

@@ -117,7 +117,7 @@ def test_frames_are_stamped_in_the_middle_of_their_exposure(recording):
     assert source.status().n_lost == 1
 
 
-def test_rising_edges_become_counted_pulses_and_others_do_not(recording):
+def test_davis_rising_edges_are_pulses(recording):
     came, _ = play(recording, camera())
     pulses = [sample for sample in came if isinstance(sample, Pulse)]
     assert [pulse.stamp_ns for pulse in pulses] == [

@@ -50,7 +50,7 @@ def counts(samples):
     return [sample.count for sample in samples if isinstance(sample, Pulse)]
 
 
-def test_samples_come_in_order_and_then_the_reason_of_the_end():
+def test_reading_error_follows_the_samples():
     with attached(Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone"))) as (source, samples):
         came = []
         with pytest.raises(SourceError, match="gone"):
@@ -79,7 +79,7 @@ def test_reading_oldest_samples_are_dropped():
     assert [sample.count for sample in came if isinstance(sample, Pulse)] == [6, 7, 8, 9]
 
 
-def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one():
+def test_reading_driver_bug_is_source_error():
     with (
         attached(Script([pulse(0)], ZeroDivisionError("oops"))) as (_, samples),
         pytest.raises(SourceError) as caught,
@@ -103,7 +103,7 @@ def test_reading_failed_sensor_is_reopened():
         assert {name: status.n_dropped for name, status in sensors.statuses().items()} == {"s": 0, "t": 0}
 
 
-def test_what_comes_while_others_are_being_opened_is_no_loss():
+def test_attach_early_overflow_is_no_loss():
     class Slow(Script):
         def open(self):
             while early.entries:

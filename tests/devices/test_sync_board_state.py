@@ -197,7 +197,7 @@ def test_lines_cut_anywhere_are_joined_again(bodies, random):
     st.sampled_from(sorted(BODIES)),
     st.lists(st.tuples(st.integers(0, 60), st.integers(0, 4), st.binary(max_size=8)), min_size=1, max_size=3),
 )
-def test_a_damaged_line_makes_no_message_that_its_sum_denies(body, damages):
+def test_sync_damaged_lines_give_no_message(body, damages):
     data = write_sentence(body)
     for at, n_cut, put in damages:
         data = data[:at] + put + data[at + n_cut :]

@@ -165,7 +165,7 @@ def explain(lidar, packets=None, **options):
     return caught.value
 
 
-def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar):
+def test_vlp16_absent_sensor_lists_checks(lidar):
     error = explain(lidar)
     assert HERE in error.what and str(lidar.driver.port) in error.what
     for word in ("power", "cable", "192.168.1.x", "driver.address", "firewall"):

@@ -82,7 +82,7 @@ def test_absent_sensors_are_left_out_of_the_verdict():
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
-def test_doubts_of_a_driver_about_its_clock_stand_in_its_line():
+def test_driver_clock_problems_stand_in_line():
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
     arrival = Finding("clock.arrival", "note")
     line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")

@@ -17,7 +17,7 @@ def with_trigger(**trigger):
     return with_sync(triggers={"cam": {"channel": 0, "rate_hz": 20.0, **trigger}})
 
 
-def test_as_many_frames_as_pulses_are_green_with_their_delay():
+def test_equal_images_and_pulses_are_a_note():
     line = look(check_frames_of_pulses, examination(camera(), sync_board()), "cam")
     assert line is not None and line.severity == "note"
     counts, delay = line.findings

@@ -82,7 +82,7 @@ def test_extrinsics_notations_agree(rles, make, tmp_path):
     np.testing.assert_array_equal(pair["covariance"]["matrix"], calibration.cov)
 
 
-def test_static_transforms_for_both_ros_versions_say_the_same(rles, make, tmp_path):
+def test_static_tf_ros1_equals_ros2(rles, make, tmp_path):
     (path,) = export([make()], rles, tmp_path, formats=["static_tf"])
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     # What ROS 2 is told is read back elsewhere; ROS 1 takes the same values in the same order, without names.
@@ -116,7 +116,7 @@ def test_export_several_sensors_share_a_tree(three_sensor_rig, make, tmp_path, b
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
-def test_sensors_that_no_calibration_connects_get_a_urdf_each(three_sensor_rig, make, tmp_path):
+def test_export_unconnected_gives_two_urdfs(three_sensor_rig, make, tmp_path):
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
     paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
@@ -242,7 +242,7 @@ def test_fit_lens_fewer_terms_cover_image(focal_px, limit_px):
 
 
 @pytest.mark.parametrize("n_coefficients", [4, 5])
-def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(three_sensor_rig, n_coefficients):
+def test_fit_lens_reported_error_is_true(three_sensor_rig, n_coefficients):
     true = three_sensor_rig.cameras["left"].to_intrinsics()
     lens, rms_px, max_px = fit_lens(true, f"radtan{n_coefficients}")
     assert len(lens.distortion) == n_coefficients

@@ -153,7 +153,7 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path)
         build_trees([make()], elsewhere, whole)
 
 
-def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles, make, tmp_path):
+def test_autoware_kit_keeps_robot_frames(rles, make, tmp_path):
     import yaml
 
     housing = placed(0.0) * [[1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]]  # 0.2 m above its base

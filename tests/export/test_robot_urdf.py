@@ -145,7 +145,7 @@ def test_urdf_sensor_nearest_root_stays(three_sensor_rig, make, tmp_path):
         np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
 
 
-def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles, make, tmp_path):
+def test_mount_is_the_root_of_outputs(rles, make, tmp_path):
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
     export([make()], rig, tmp_path)

@@ -66,7 +66,9 @@ def test_moved_far_from_nominal_counts(result):
     assert history_of(as_table([result("r1", 0), result("r1", 1, MOVE, **far)])).robots == {"r1": "moved"}
 
 
-def test_shared_errors_count_only_between_profiles_or_methods(result):
+def test_moved_shared_errors_need_a_change(result):
+    """They count between profiles or methods only."""
+
     def state(**changes):
         rows = [result("r1", 0, shared=99.0), result("r1", 1, MOVE, shared=99.0, **changes)]
         return history_of(as_table(rows)).robots["r1"]

@@ -40,7 +40,7 @@ def test_targets_empty_file_gets_own_advice(tmp_path, text):
     assert "rigs new" not in caught.value.hint
 
 
-def test_a_target_that_names_isaac_gets_the_urdf_that_it_was(tmp_path):
+def test_target_isaac_format_becomes_urdf(tmp_path):
     text = "targets: {heron: {to: /opt, formats: [isaac]}, kestrel: {to: /opt, formats: [isaac, urdf]}}"
     targets = read_targets(write(tmp_path / "deploy.yaml", text))
     assert [target.formats for target in targets.values()] == [("urdf",), ("urdf",)]

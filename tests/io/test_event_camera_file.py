@@ -108,7 +108,7 @@ def test_event_file_takes_first_camera(tmp_path, rles):
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 
 
-def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path, rles):
+def test_davis_torn_file_gives_its_beginning(tmp_path, rles):
     whole = write_davis(tmp_path / "whole.aedat4", PIECES, FRAMES).read_bytes()
     (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 5])
     recording = opened(tmp_path / "torn.aedat4", rles)

@@ -146,7 +146,8 @@ def test_two_days_of_pictures_and_packets_stay_apart(tmp_path, rlfs):
         list(check_overlap(joined[1].samples(), rlfs, []))  # type: ignore[attr-defined]
 
 
-def test_pictures_without_times_or_without_scans_are_refused(tmp_path, rlfs):
+def test_recorded_images_without_scans_fail(tmp_path, rlfs):
+    """Images without times fail, too."""
     fill_with_pictures(tmp_path)
     with pytest.raises(SourceError):
         open_recordings([tmp_path / "webcam"], rlfs)

@@ -130,7 +130,7 @@ def einride(recordings):
 
 
 @pytest.mark.dataset
-def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings):
+def test_einride_payloads_lose_no_packet(recordings):
     stream = stream_of()
     fields = einride(recordings)
     scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]

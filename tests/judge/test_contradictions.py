@@ -8,7 +8,7 @@ RIG = load_rig("rlfs")
 GOOD = Metrics(mpe_m=0.008, mee_m=0.006, reprojection_px=0.1)
 
 
-def test_one_board_that_the_lidar_missed_is_no_contradiction():
+def test_one_board_missed_is_not_reported():
     assert contradictions(GOOD, RIG, n_elsewhere=1, n_seen=30) == ()
 
 

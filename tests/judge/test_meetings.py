@@ -66,7 +66,7 @@ def test_planes_meet_once_the_motion_is_taken_off(
 
 
 @pytest.mark.parametrize("channel", ["frames", "events"])
-def test_the_lidars_board_is_drawn_where_the_picture_shows_it(
+def test_meetings_move_lidar_to_image_time(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
     for meeting in bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS).values():

@@ -65,7 +65,8 @@ def test_uncertainties_that_are_too_small_are_found_out():
     assert compared.finding.figure("ratio") == compared.ratio
 
 
-def test_the_mean_lies_between_and_the_order_does_not_matter():
+def test_repeat_mean_ignores_the_order():
+    """The mean is weighted by the covariances."""
     sure = calibration(perturb(TRUTH, np.full(6, 1e-3)), 1e-4 * COV)
     rough = calibration(perturb(TRUTH, np.full(6, -1e-3)), COV)
     compared = compare_calibrations({"sure": sure, "rough": rough})

@@ -83,7 +83,7 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
     assert [file.stat().st_mtime_ns for file in files] == changed
 
 
-def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
+def test_event_time_applies_clock_offsets(tmp_path, stream):
     profile = PROFILE.replace("first_firing, expected_offset_s: 0.0", "first_firing, expected_offset_s: 0.02")
     profile = profile.replace("mid_exposure, expected_offset_s: 0.0", "mid_exposure, expected_offset_s: 3.5")
     early = replace(stream, t_ns=stream.t_ns - 3_480 * MS)

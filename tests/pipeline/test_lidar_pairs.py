@@ -73,7 +73,7 @@ def codes(result):
     return {finding.code for finding in result.findings if finding.severity != "note"}
 
 
-def test_the_pose_is_found_within_its_uncertainty_and_passes():
+def test_lidar_pairs_pose_fits_covariance():
     rig, chi2 = make_rig(), []
     for seed in range(4):
         result = calibrate(rig, scan_both(20, seed, rig.board.to_board()))
@@ -87,7 +87,7 @@ def test_the_pose_is_found_within_its_uncertainty_and_passes():
 
 
 @pytest.mark.parametrize("sides", [(0.7, 0.7), (0.9, 0.7)])
-def test_a_plate_that_looks_the_same_when_turned_is_no_doubt(sides):
+def test_lidar_pairs_symmetric_plate_is_fine(sides):
     rig = make_rig({"type": "plain", "width_m": sides[0], "height_m": sides[1]})
     scans = scan_both(14, 3, rig.board.to_board())
     n_fold = 4 if sides[0] == sides[1] else 2

@@ -92,7 +92,7 @@ def test_write_one_camera_keeps_the_other(tmp_path):
     assert [c.camera for c in read_result(folder / "previous" / "result.json").pairs] == ["left"]
 
 
-def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
+def test_write_keeps_last_failed_if_no_other(session, folder):
     write(session, FAILED)
     written = write(session, calibration(verdict="fail", captures_used=()), force=True)
     assert written.previous is not None and not written.has_usable_previous

@@ -30,7 +30,7 @@ def fill(rig, samples):
     return make
 
 
-def test_provenance_joins_captures_profile(fill, rig, tmp_path):
+def test_provenance_joins_captures_and_rig(fill, rig, tmp_path):
     named = changed(rig.of_robot("kestrel"), cameras__cam__serial="C7")
     found = provenance_of(fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"}))
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})

@@ -54,7 +54,7 @@ def test_a_session_without_captures_takes_another_profile(tmp_path, rig):
     assert Session.open(tmp_path / "s").rig == load_rig("rles")
 
 
-def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, samples):
+def test_resume_other_driver_is_accepted(tmp_path, rig, samples):
     with Session.resume(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
     moved = changed(rig, cameras__cam__driver__device="/dev/video7")
@@ -95,7 +95,7 @@ def test_folders_that_are_no_session_are_left_alone(tmp_path, rig):
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_session_whose_creation_was_cut_off_is_created_anew(tmp_path, rig):
+def test_resume_cut_creation_starts_again(tmp_path, rig):
     Session.create(tmp_path / "s", rig).close()
     (tmp_path / "s" / "session.json").unlink()
     Session.resume(tmp_path / "s", rig).close()
@@ -154,7 +154,7 @@ def test_the_journal_is_appended_and_a_torn_line_is_skipped(tmp_path, rig):
     assert session.read_journal()[-1]["captured"] == 3
 
 
-def test_cached_arrays_come_back_and_damage_counts_as_nothing(tmp_path):
+def test_load_arrays_damage_is_never_wrong(tmp_path):
     file = tmp_path / "detections" / "abc" / "000000.npz"
     arrays = {"b": np.arange(6).reshape(2, 3), "a": np.array([1.5])}
     assert store_arrays(file, arrays)

@@ -38,7 +38,7 @@ def n_rings_on_board(rig, lidar, capture):
     return int(np.sum(np.bincount(scan.ring[inside], minlength=16) >= 5))
 
 
-def test_truth_differs_from_the_nominal_within_its_tolerance(rig):
+def test_truth_is_within_nominal_tolerance(rig):
     entry = rig.nominal_extrinsics[0]
     nominal = entry.to_matrix()
     truths = [truth_extrinsics(rig, seed)["cam", "lidar"] for seed in range(20)]

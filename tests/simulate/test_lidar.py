@@ -163,7 +163,7 @@ def test_dark_squares_and_weak_returns_read_long(board, T_world_lidar):
     assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
 
 
-def test_rim_noise_moves_points_near_the_border_and_no_others(board, T_world_lidar):
+def test_rim_noise_moves_border_points_only(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
     plain, rimmed = (scan_of(scene, T_world_lidar, replace(EXACT, rim_spread_rad=w)) for w in (0.0, 0.0015))
     moved_m = np.linalg.norm(plain.points - rimmed.points, axis=1)

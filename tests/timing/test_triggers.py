@@ -158,7 +158,7 @@ def test_trigger_losses_do_not_restart(seed):
     assert counts["n_restarts"] == 0
 
 
-def test_the_time_of_a_lost_line_lies_between_its_neighbours():
+def test_trigger_lost_line_is_interpolated():
     rig = Rig(seed=3, lost_lines=0.1, drift=40e-6)
     _, matched = rig.run()
     came = {pulse.count for pulse in rig.streams() if isinstance(pulse, Pulse)}

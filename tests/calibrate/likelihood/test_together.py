@@ -53,7 +53,7 @@ def runs():
     return run([few_on_the_right(16, seed) for seed in range(3)])
 
 
-def test_a_camera_with_few_captures_gains_from_one_with_many(runs):
+def test_join_few_captures_gain_accuracy(runs):
     for own, together in runs:
         before, after = own[RIGHT], together.estimates[RIGHT, "lidar"]
         for part in (slice(0, 3), slice(3, 6)):

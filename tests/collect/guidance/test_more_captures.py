@@ -34,7 +34,7 @@ def test_plan_few_captures_reaches_minimum(placements):
         assert n + plan(rig, placements[:n])["n_captures"] >= rig.quality.min_captures
 
 
-def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements):
+def test_plan_like_boards_adds_tilted_ones(placements):
     alike = np.repeat(placements[:1], 5, axis=0)
     alike[:, :3, 3] *= np.linspace(0.7, 1.0, 5)[:, None]
     assert any(group[3] for group in plan(load_rig("rlfs"), alike)["placements"])

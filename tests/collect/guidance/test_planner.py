@@ -165,7 +165,7 @@ def crowded():
     return bold, crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015]))
 
 
-def test_beyond_the_target_only_what_was_captured_is_refused():
+def test_planner_target_met_refuses_repeats():
     bold, crowd, present = crowded()
     refusal = bold.adds_nothing(crowd, present)
     assert refusal.code == "calibrate.little_gain" and refusal.figure("gain") < refusal.figure("best_gain")
@@ -183,7 +183,7 @@ def test_planner_asked_place_is_accepted():
     assert bold.adds_nothing(crowd, crowd[2], asked=crowd[2]).figures["capture"] == "3"
 
 
-def test_no_board_is_refused_for_a_better_place_out_of_reach():
+def test_planner_unreachable_gain_is_ignored():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present, avoid=bold.candidates) is None
 

@@ -58,7 +58,7 @@ def test_collect_still_boards_are_captured(tmp_path):
 
 
 @pytest.mark.long
-def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path):
+def test_collect_keys_capture_skip_and_stop(tmp_path):
     asked = ["next", "capture"]
     states = []
     show = Show(placements()[:1], each_s=100.0)

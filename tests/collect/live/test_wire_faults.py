@@ -44,7 +44,7 @@ def test_collect_unplugged_camera_reconnects(wire, tmp_path):
 
 
 @pytest.mark.long
-def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(wire, reel, tmp_path):
+def test_collect_silent_lidar_reconnects(wire, reel, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)

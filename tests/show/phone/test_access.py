@@ -31,7 +31,7 @@ def test_without_the_token_there_is_nothing(query):
             watcher.watch(query)
 
 
-def test_the_link_opens_the_page_and_its_cookie_all_it_loads():
+def test_link_sets_cookie_for_all_requests():
     with Preview(port=0, token="abcdefgh") as preview, Watcher(preview.urls[0]) as watcher:
         preview.publish(state())
         status, headers, content = watcher.get("?token=abcdefgh")

@@ -66,7 +66,7 @@ def test_a_failed_result_is_explained(one, page):
 
 
 @pytest.mark.parametrize("has_previous", [True, False])
-def test_the_earlier_result_is_named_only_where_there_is_one(one, page, has_previous):
+def test_page_names_previous_if_there_is_one(one, page, has_previous):
     failed = replace(one, verdict="fail")
     text = page(RLFS, failed, has_previous=has_previous)
     assert ("previous/" in text) is has_previous
