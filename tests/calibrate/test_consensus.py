@@ -31,7 +31,7 @@ def somewhere_else(seed, T_cam_lidar=T_FORWARD):
         ("on its side", (0, 20, 95)),
     ],
 )
-def test_the_extrinsic_is_found_however_the_lidar_is_mounted(mounting, turn_deg):
+def test_consensus_any_mounting_is_found(mounting, turn_deg):
     R_turn = exp_so3(np.radians(np.array(turn_deg, dtype=float)))
     T = pose(T_FORWARD[:3, :3] @ R_turn.T, np.array([0.3, -0.2, 0.15]))
     captures = simulate(10, seed=3, T_cam_lidar=T)
@@ -42,7 +42,7 @@ def test_the_extrinsic_is_found_however_the_lidar_is_mounted(mounting, turn_deg)
     assert distance_m < 0.05
 
 
-def test_a_decoy_that_stands_still_and_comes_first_everywhere_is_not_taken():
+def test_consensus_static_decoy_is_not_taken():
     captures = simulate(12, seed=1)
     decoy = somewhere_else(99)
     consensus = find_consensus([with_decoy(item, decoy, is_first=True) for item in captures], BOARD)
@@ -50,7 +50,8 @@ def test_a_decoy_that_stands_still_and_comes_first_everywhere_is_not_taken():
     assert all(observation.lidar is not decoy for observation in consensus.observations)
 
 
-def test_three_rivals_at_every_capture_and_a_third_of_them_without_the_board_are_survived():
+def test_consensus_many_rivals_are_rejected():
+    """Every capture has three rivals, and every third capture lacks the board."""
     captures = []
     for k, item in enumerate(simulate(15, seed=2)):
         rivals = [somewhere_else(1000 + 3 * k + j) for j in range(3)]
@@ -66,7 +67,7 @@ def test_three_rivals_at_every_capture_and_a_third_of_them_without_the_board_are
         assert (refusal.code, refusal.figures["n_candidates"]) == ("pair.elsewhere", 3)
 
 
-def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():
+def test_consensus_swapped_pose_is_corrected():
     captures = simulate(12, seed=4, scenario=Scenario(corner_sigma_px=0.3))
     swapped = []
     for item in captures[:4]:

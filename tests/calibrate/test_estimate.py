@@ -31,7 +31,7 @@ def rms_deg_mm(errors):
 
 
 @pytest.mark.long
-def test_thirty_captures_reach_a_few_hundredths_of_a_degree_and_say_so():
+def test_estimate_30_captures_is_accurate():
     errors, nees = errors_over_seeds(Scenario(range_sigma_m=0.02, corner_sigma_px=0.3), 30, 8)
     rotation_deg, translation_mm = rms_deg_mm(errors)
     assert rotation_deg < 0.06
@@ -55,7 +55,7 @@ def test_exact_data_give_the_exact_extrinsic():
     assert estimate.certificate.is_optimal
 
 
-def test_ring_ends_beyond_the_printed_edge_are_explained_by_the_shift():
+def test_estimate_footprint_is_edge_shift():
     figures = fit_extrinsic(simulate(20, 0, Scenario(footprint_m=0.008)), BOARD, FAST).diagnostics
     assert abs(figures.edge_shift_m - 0.008) < 4 * figures.edge_shift_sigma_m + 3e-4
 
@@ -92,14 +92,14 @@ def spoil(captures, numbers):
     return spoilt
 
 
-def test_of_many_captures_those_whose_board_moved_are_refused_too():
+def test_estimate_moved_of_100_are_refused():
     numbers = (2, 3, 50, 62, 90)
     estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, FAST)
     assert set(estimate.refused) == {f"{k:06d}" for k in numbers}
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.1
 
 
-def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
+def test_estimate_moved_board_is_refused():
     spoilt = spoil(simulate(15, 9), [4])
     estimate = fit_extrinsic(spoilt, BOARD, FAST)
     assert set(estimate.refused) == {"000004"}
@@ -117,7 +117,7 @@ def test_too_few_captures_are_refused_with_their_number():
     assert caught.value.finding.figures["n_captures"] == 2
 
 
-def test_nearly_parallel_boards_are_refused_with_the_weak_direction_named():
+def test_estimate_parallel_boards_is_refused():
     captures = simulate(10, 1, Scenario(facing_deg=1.0, distance_m=(2.0, 2.2)))
     facing = [item for item in captures if abs(item.image.T_cam_board[2, 2]) > 0.9]
     with pytest.raises(NotEnoughDataError) as caught:
@@ -135,7 +135,7 @@ def test_three_well_tilted_boards_are_enough():
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 1.0
 
 
-def test_residuals_are_those_of_the_extrinsic_and_grow_away_from_it():
+def test_estimate_residuals_match_extrinsics():
     estimate = fit_extrinsic(simulate(8, 2, Scenario(range_sigma_m=0.01)), BOARD, FAST)
     assert 0.004 < estimate.metrics.mpe_m < 0.012
     assert estimate.metrics.mge_m == estimate.metrics.mpe_m + estimate.metrics.mee_m
@@ -148,7 +148,7 @@ def test_residuals_are_those_of_the_extrinsic_and_grow_away_from_it():
 
 
 @pytest.mark.parametrize("method", ["ml", "paper"])
-def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
+def test_estimate_repeats_keep_sigma(method):
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
     options = EstimateSettings(method)
@@ -158,12 +158,12 @@ def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     assert np.all(ratio > 0.85)
 
 
-def test_the_error_to_a_reference_is_the_angle_and_the_distance():
+def test_error_to_reference_angle_distance():
     T = pose(exp_so3(np.radians([0.0, 0.3, 0.0])) @ T_FORWARD[:3, :3], T_FORWARD[:3, 3] + [0.003, 0, 0.004])
     np.testing.assert_allclose(error_to_reference(T, T_FORWARD), (0.3, 0.005), rtol=1e-9)
 
 
-def test_noise_of_the_range_is_what_the_plane_residual_shows():
+def test_plane_residual_shows_range_noise():
     captures = simulate(6, 0, Scenario(range_sigma_m=0.02, corner_sigma_px=0.0))
     residuals = [capture_residual(T_FORWARD, item, BOARD) for item in captures]
     rms_m = np.sqrt(np.mean([r.plane_rms_m**2 for r in residuals]))
@@ -171,7 +171,8 @@ def test_noise_of_the_range_is_what_the_plane_residual_shows():
     assert 0.014 < rms_m < 0.0205
 
 
-def test_a_capture_without_ring_ends_does_not_spoil_the_mean():
+def test_residuals_without_ring_ends_are_nan():
+    """The mean is that of the captures with ring ends."""
     item = simulate(1, 0)[0]
     bare = replace(
         item,

@@ -44,7 +44,7 @@ def normalised(errors, seed):
 
 
 @pytest.mark.long
-def test_sessions_with_extrinsics_of_their_own_give_the_lasers_errors_within_their_deviations():
+def test_lidar_errors_match_deviations():
     errors = measured(3)
     assert errors.n_captures == (8, 8)
     assert errors.gain[0] > 2
@@ -54,7 +54,7 @@ def test_sessions_with_extrinsics_of_their_own_give_the_lasers_errors_within_the
 
 
 @pytest.mark.long
-def test_errors_known_from_other_sessions_sharpen_a_later_one():
+def test_known_laser_errors_sharpen_estimate():
     known = measured(3).found
     later = observations(3, slice(16, 24), T_FORWARD)
     plain, helped = (
@@ -73,7 +73,7 @@ def test_errors_known_from_other_sessions_sharpen_a_later_one():
 
 
 @pytest.mark.slow
-def test_reported_deviations_are_those_of_many_simulated_lidars():
+def test_lidar_errors_deviations_fit_scatter():
     squares = [np.mean((WIDENED[0] * normalised(measured(seed), seed)) ** 2) for seed in range(20)]
     # Simulated images lack the pose errors of recorded ones, which the noise levels' priors expect.
     assert 0.6 < np.mean(squares) < 1.25

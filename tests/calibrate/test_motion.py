@@ -30,7 +30,7 @@ def samples_of(captures, noise_px):
     return sample_poses(scans, Clocks(), noise_px)
 
 
-def test_rates_of_motion_are_found_within_their_stated_uncertainty():
+def test_fit_motions_rates_match_covariance():
     captures = simulate_moving(40, 3, TRACKED)
     samples = samples_of(captures, {"frames": 0.1, "events": 0.2})
     offset_s = np.array([dict(TRACKED.offset_s)[channel] for channel in samples.channels])
@@ -76,7 +76,7 @@ def scores_of(results, moving):
     ]
 
 
-def test_time_offsets_of_boards_that_were_followed_are_found_to_milliseconds(followed):
+def test_motion_time_offsets_are_found_to_ms(followed):
     results = [result for _, result in followed]
     # Eight scores: the 99.9 % point of chi-squared over its freedoms is 3.3.
     assert np.mean(np.square(scores_of(results, TRACKED))) < 3.3
@@ -93,7 +93,7 @@ def test_time_offsets_are_found_from_two_pictures_a_capture():
     assert np.mean(np.square(scores_of(results, moving))) < 4.6
 
 
-def test_compensation_brings_the_error_of_moving_boards_down_to_that_of_still_ones(followed):
+def test_motion_compensation_halves_error(followed):
     compensated = [errors(result.T_cam_lidar) for _, result in followed]
     plain = [
         errors(fit_extrinsic(captures["events"], BOARD, OPTIONS).T_cam_lidar) for captures, _ in followed
@@ -126,7 +126,7 @@ def test_a_channel_that_is_followed_is_compensated_alone():
     assert np.all(errors(result.T_cam_lidar) < [0.1, 4.0])
 
 
-def test_the_expected_offset_of_the_profile_is_taken_off_first():
+def test_motion_profile_offset_is_subtracted():
     captures = simulate_moving(25, 2, TRACKED)
     clocks = Clocks(channel_offset_s=dict(TRACKED.offset_s))
     for channel in estimate_extrinsics(captures, BOARD, OPTIONS, clocks).channels:
@@ -134,7 +134,7 @@ def test_the_expected_offset_of_the_profile_is_taken_off_first():
 
 
 @pytest.mark.long
-def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
+def test_motion_unstamped_images_are_timed():
     moving = Moving(has_stamps=False)
     captures = simulate_moving(25, 0, moving)
     result = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
@@ -145,14 +145,14 @@ def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
         assert abs(channel.time_offset_s - dict(moving.offset_s)[channel.channel]) < 0.02
 
 
-def test_boards_that_stand_still_are_not_moved_and_say_nothing_of_time():
+def test_motion_still_boards_give_no_offset():
     captures = simulate_moving(20, 4, Moving(speed_mps=0.0, turn_deg_s=0.0))
     together = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     assert np.all(errors(together.T_cam_lidar) < [0.06, 2.5])
     assert all(channel.time_offset_s is None for channel in together.channels)
 
 
-def test_one_channel_that_is_not_followed_is_calibrated_as_before():
+def test_motion_single_channel_is_unchanged():
     captures = simulate_moving(12, 0)["frames"]
     plain = fit_extrinsic(captures, BOARD, OPTIONS)
     result = estimate_extrinsics({"frames": captures}, BOARD, OPTIONS, Clocks())
@@ -162,7 +162,7 @@ def test_one_channel_that_is_not_followed_is_calibrated_as_before():
     assert result.channel_difference is None
 
 
-def test_pictures_that_read_the_board_upside_down_are_turned(followed):
+def test_motion_upside_down_image_is_turned(followed):
     captures, right = followed[0]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     flipped = [
@@ -175,7 +175,7 @@ def test_pictures_that_read_the_board_upside_down_are_turned(followed):
     np.testing.assert_allclose(turned.T_cam_lidar, right.T_cam_lidar, atol=1e-6)
 
 
-def test_the_same_scan_in_two_captures_is_one_placement_seen_twice():
+def test_motion_same_scan_is_one_placement():
     captures = simulate_moving(15, 0)
     elsewhere = [replace(item, capture=f"1{item.capture[1:]}") for item in captures["events"]]
     result = estimate_extrinsics(
@@ -185,7 +185,7 @@ def test_the_same_scan_in_two_captures_is_one_placement_seen_twice():
     assert result.same_scan["000003"] == ("000003", "100003")
 
 
-def test_channels_that_put_the_camera_in_two_places_are_held_against_each_other(followed):
+def test_motion_channel_difference_is_found(followed):
     apart = (0.03, 0.0, 0.0, 0.0, np.radians(1.0), 0.0)
     moved = estimate_extrinsics(
         simulate_moving(20, 0, replace(TRACKED, apart=apart)), BOARD, OPTIONS, Clocks()

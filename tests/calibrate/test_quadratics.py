@@ -22,7 +22,7 @@ def sample_regressions(n_groups, n_trials, seed=0):
     return np.array(errors), np.array(covariances)
 
 
-def test_normalised_errors_have_the_right_size_although_residuals_of_a_group_share_their_error():
+def test_quadratics_grouped_nees_is_near_3():
     errors, covariances = sample_regressions(n_groups=25, n_trials=800)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     assert 2.3 < nees.mean() < 3.5  # 3 expected
@@ -34,7 +34,7 @@ def test_few_groups_are_not_trusted_too_far():
     assert np.median(nees) < 2.37  # the median of chi square with 3 degrees
 
 
-def test_moves_are_those_of_estimates_made_anew_without_each_group():
+def test_moves_match_leave_one_group_out():
     rng = np.random.default_rng(1)
     group = np.array([0, 0, 1, 2, 2, 2, 3])
     A, b = rng.normal(size=(7, 5, 3)), rng.normal(size=(7, 5))
@@ -53,7 +53,7 @@ def test_moves_are_those_of_estimates_made_anew_without_each_group():
     np.testing.assert_allclose(jackknife_scatter(moves), expected, atol=1e-12)
 
 
-def test_a_direction_without_information_gets_a_large_finite_variance():
+def test_inverse_singular_variance_is_finite():
     inverse = symmetric_inverse(np.diag([4.0, 1.0, 0.0]))
     np.testing.assert_allclose(np.diag(inverse)[:2], [0.25, 1.0])
     assert 1e6 < inverse[2, 2] < np.inf

@@ -70,7 +70,7 @@ def test_the_extrinsic_is_near_the_reference(recordings, recording, profile, n_c
 
 
 @pytest.mark.parametrize("method", get_args(Method))
-def test_the_extrinsic_is_that_of_points_as_the_driver_labels_them(recordings, method):
+def test_recording_sss_matches_driver_labels(recordings, method):
     """The simulator labels its clouds half an azimuth step of 360 / 1874 deg beside its rays."""
     rig, folder = load_rig("sss"), recordings / "sss_noise15mm"
     (camera,), (lidar,) = rig.cameras.values(), rig.lidars.values()
@@ -116,7 +116,7 @@ cameras:
 
 
 @pytest.mark.long
-def test_a_lidar_without_rings_finds_the_board_and_halves_agree(recordings):
+def test_recording_avia_halves_agree(recordings):
     rig = parse_rig(AVIA)
     finder, lidar, seen = BoardFinder(rig), rig.lidars["lidar"], []
     for path in sorted((recordings / "livox_avia" / "img").glob("*.jpg")):

@@ -34,7 +34,7 @@ def captures():
     "errors",
     [(0.003, 4.0, -5.0, 2.0), (0.02, 10.0, -10.0, 0.0), (0.02, 0.0, 0.0, 0.0), (-0.02, 0.0, 0.0, 0.0)],
 )
-def test_the_lens_is_the_true_one_within_its_deviations_wherever_the_profile_lies(captures, errors):
+def test_session_lens_matches_true_lens(captures, errors):
     prior = replace(ROUGH, lens=with_errors(CAMERA, errors))
     lens = fit_session_lens({"frames": as_profiled(captures, prior.lens)}, BOARD, prior)
     model = lens.estimate.model
@@ -43,7 +43,7 @@ def test_the_lens_is_the_true_one_within_its_deviations_wherever_the_profile_lie
     assert lens.estimate.is_contradicted == (abs(errors[0]) > 0.01)
 
 
-def test_boards_contradict_few_profiles_within_their_deviations(captures):
+def test_session_lens_rarely_contradicts(captures):
     contradicted = 0
     for errors in np.random.default_rng(0).normal(size=(12, 4)) * (0.004, 3.6, 3.6, 2.2):
         prior = replace(ROUGH, lens=with_errors(CAMERA, tuple(errors)))
@@ -89,7 +89,7 @@ def test_the_lidar_does_not_move_the_lens(captures):
 
 
 @pytest.mark.parametrize("method", ["ml", "paper"])
-def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
+def test_lens_change_moves_extrinsics(captures, method):
     estimate = fit_extrinsic(captures, BOARD, replace(of_profile(ROUGH), method=method))
     lens = estimate.lens
     (by_lens,) = (each for each in estimate.sensitivities if each.source == "intrinsics")
@@ -107,7 +107,7 @@ def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
     np.testing.assert_allclose(change, matrix, atol=0.15 * np.linalg.norm(matrix))
 
 
-def test_a_turn_by_the_principal_point_leaves_points_in_the_image_where_they_are(captures):
+def test_session_lens_joint_centre_is_right(captures):
     """Extrinsics are known better with the lens of the same result than alone, and the true errors agree."""
     prior = replace(ROUGH, lens=with_errors(CAMERA, (0, 5.0, -4.0, 0)))
     estimate = fit_extrinsic(as_profiled(captures, prior.lens), BOARD, of_profile(prior))

@@ -43,7 +43,7 @@ def linearised(captures):
 
 
 @pytest.mark.parametrize("rings", [[5], [11], list(range(16))])
-def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings):
+def test_longer_ranges_match_sensitivities(rings):
     captures = simulate(15, 4)
     T, shift_m, columns = linearised(captures)
     seen = np.unique(np.concatenate([item.lidar.ring for item in captures]))
@@ -77,11 +77,11 @@ def test_range_errors_of_known_size_are_in_the_covariance(n_seeds):
 
 
 @pytest.mark.long
-def test_range_errors_of_which_nothing_is_known_are_not_in_the_covariance():
+def test_range_errors_unknown_raise_nees():
     assert normalised_errors(NO_DRAWS, 12).mean() > 12.0
 
 
-def test_a_common_offset_moves_the_lidar_by_about_its_size_and_is_claimed_so():
+def test_range_offset_is_in_the_covariance():
     options = replace(NO_DRAWS, range_offset_sigma_m=0.02)
     estimate = fit_extrinsic(simulate(20, 3, Scenario(range_offset_m=0.02)), BOARD, options)
     error = difference(estimate.T_cam_lidar, T_FORWARD)
@@ -90,7 +90,7 @@ def test_a_common_offset_moves_the_lidar_by_about_its_size_and_is_claimed_so():
     assert error @ np.linalg.solve(estimate.cov, error) < 16.8  # 99 % of chi square with 6 degrees
 
 
-def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
+def test_systematic_errors_only_widen():
     captures = simulate(12, 6)
     pure = fit_extrinsic(captures, BOARD, NO_DRAWS)
     wider = fit_extrinsic(
@@ -110,7 +110,7 @@ def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
         assert np.hypot(scatter, added) == pytest.approx(trace(wider.cov))
 
 
-def test_shared_errors_scatter_the_estimate_as_their_covariance_says():
+def test_systematic_covariance_fits_samples():
     rng = np.random.default_rng(3)
     sensitivities = rng.normal(size=(3, 5))
     own = 0.2 * rng.normal(size=(100_000, 5))

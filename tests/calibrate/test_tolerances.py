@@ -66,7 +66,7 @@ def moves_of(estimate, source):
         ("plate_size", replace(BOARD, width_m=BOARD.width_m + 0.005), [0.005, 0.0]),
     ],
 )
-def test_a_wrong_board_moves_the_solution_as_its_sensitivities_say(method, source, board, errors):
+def test_wrong_board_matches_sensitivities(method, source, board, errors):
     exact = replace(KNOWN, lens=LensPrior(CAMERA, 0.0, 0.0, 0.0, is_board_exact=True))
     captures, settings = simulate(20, 1, REAL), replace(SETTINGS, method=method, tolerances=exact)
     sound = fit_extrinsic(captures, BOARD, settings)
@@ -115,7 +115,8 @@ def normalised_errors(method, seeds, n_captures=20):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_claims_with_lens_and_board_hold_where_the_captures_alone_would_not(method):
+def test_tolerances_95_regions_cover_truth(method):
+    """Without the tolerances of lens and board, fewer than 90 % do."""
     from scipy.stats import chi2
 
     without, whole = normalised_errors(method, range(100)).T

@@ -38,7 +38,7 @@ def keep(session, n_captures):
 
 
 @pytest.mark.long
-def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, session):
+def test_wrong_corner_count_names_both(lce_rig, session):
     keep(session, 3)
     edit_profile(session, board__inner_corners=[8, 5])
     outcome = lce_rig("calibrate", session)
@@ -60,14 +60,14 @@ def test_calibrate_squares_of_other_size_are_named(lce_rig, session, square_m, m
         assert scale["square_m"] == pytest.approx(measured_m, abs=0.001)
 
 
-def test_width_and_height_swapped_are_found_in_the_profile_already(lce_rig, session):
+def test_swapped_width_height_is_refused(lce_rig, session):
     edit_profile(session, board__width_m=0.6, board__height_m=0.8)
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 4
     assert "0.6 x 0.8 m" in outcome.err
 
 
-def test_intrinsics_of_another_resolution_are_named_with_both_sizes(lce_rig, session):
+def test_other_resolution_names_both_sizes(lce_rig, session):
     keep(session, 3)
     camera = "cameras__davis__"
     edit_profile(
@@ -100,7 +100,7 @@ def test_pictures_without_a_board_say_so(lce_rig, session, tmp_path):
     assert "0 of 3 captures" in outcome.out
 
 
-def test_a_session_whose_captures_are_all_damaged_names_the_damage(lce_rig, session):
+def test_all_captures_damaged_is_refused(lce_rig, session):
     for capture in (session / "captures").iterdir():
         (capture / "meta.json").write_text("{}")
     outcome = lce_rig("check", session)
@@ -119,7 +119,7 @@ def furnish_with_a_plate(low, high, _rng):
 
 
 @pytest.mark.long
-def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):
+def test_static_plate_is_not_the_board(tmp_path):
     """The decoy is in every scan; only the board moves with what the camera sees."""
     session, rig = tmp_path / "session", load_rig("rles")
     options = replace(SimulationOptions.for_rig("rles"), furnish=furnish_with_a_plate)

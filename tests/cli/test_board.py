@@ -59,7 +59,7 @@ def test_what_cannot_be_drawn_is_refused(lce_rig, words, code, tmp_path, monkeyp
 
 @pytest.mark.long
 @pytest.mark.parametrize("board", ["charuco:9x7,0.07,0.0525,5X5_50", "aprilgrid:4x3,0.13,0.3"])
-def test_a_session_of_a_board_with_markers_covered_in_part_gives_its_truth(lce_rig, tmp_path, board):
+def test_board_covered_markers_match_truth(lce_rig, tmp_path, board):
     """Each image's board is covered otherwise, by about 30 %; another dictionary is named once."""
     profile, session = tmp_path / "marked.yaml", tmp_path / "session"
     words = ("rigs", "new", "marked", "--from", "rlfs", "--board", f"{board},0.767x0.626", "-o", profile)

@@ -11,7 +11,7 @@ def listed(lce_rig, session):
 
 
 @pytest.mark.long
-def test_a_rejected_capture_is_used_no_more_until_it_is_restored(lce_rig, calibrated):
+def test_captures_rejected_until_restored(lce_rig, calibrated):
     before = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
     name = before["captures_used"][0]
     assert listed(lce_rig, calibrated)[name]["used_by"] == [before["camera"]]

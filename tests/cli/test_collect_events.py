@@ -50,7 +50,7 @@ def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, 
     assert all(text in outcome.err for text in said)
 
 
-def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, tmp_path):
+def test_collect_few_events_is_refused(lce_rig, tmp_path):
     few = [s.select(slice(None, None, 400)) if isinstance(s, Events) else s for s in moves.samples()]
     moves.bag(tmp_path / "few.bag", few)
     outcome = collect(lce_rig, tmp_path, tmp_path / "s", "few.bag")

@@ -62,7 +62,7 @@ def test_one_camera_named_once_is_that_of_all_folders(lce_rig, folders, tmp_path
         (["--lidar", "top"], 2, "the rig has no lidar 'top'"),
     ],
 )
-def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders, tmp_path, words, code, told):
+def test_collect_unclear_folder_is_refused(lce_rig, folders, tmp_path, words, code, told):
     outcome = lce_rig("collect", "--rig", TWO, tmp_path / "session", "--from", folders[0], *words)
     assert outcome.code == code
     assert told in outcome.err

@@ -60,7 +60,8 @@ def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path):
     assert result.code == 4 and "real" in result.err
 
 
-def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, tmp_path):
+def test_collect_unusable_preview_is_refused(lce_rig, tmp_path):
+    """Nothing is written."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         used = f"127.0.0.1:{taken.getsockname()[1]}"
         for address in (used, "99999"):
@@ -83,7 +84,7 @@ def start(path, *arguments, rig="rles", **options):
     [("rles", ("davis", "lidar")), ("mid360", ("cam", "lidar")), (TWO_LIDARS, ("front", "side"))],
     ids=["rles", "mid360", "two lidars"],
 )
-def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path, rig, pair):
+def test_collect_simulated_writes_truth(tmp_path, rig, pair):
     path = tmp_path / "session"
     process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3", rig=rig)
     _, said = process.communicate(timeout=300)
@@ -100,7 +101,7 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path
 
 
 @pytest.mark.long
-def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace(tmp_path):
+def test_collect_killed_early_no_traceback(tmp_path):
     for number in (signal.SIGINT, signal.SIGTERM):
         process = start(tmp_path / number.name, "--plain", start_new_session=True)
         assert "starting" in process.stderr.readline()
@@ -112,7 +113,7 @@ def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace
 
 @pytest.mark.long
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
-def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path, term):
+def test_collect_closed_terminal_stops(tmp_path, term):
     ours, theirs = pty.openpty()
     path = tmp_path / "session"
     environment = {**os.environ, "TERM": term}
@@ -138,9 +139,7 @@ def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path, t
 
 
 @pytest.mark.long
-def test_a_run_that_nobody_looks_after_ends_and_says_that_too_little_was_shown(
-    lce_rig, tmp_path, monkeypatch
-):
+def test_collect_unattended_run_exits_with_6(lce_rig, tmp_path, monkeypatch):
     monkeypatch.setattr("lce_rig.cli.collect_live.SIMULATED_IDLE_S", 15.0)
     session = tmp_path / "session"
     # Nobody holds a board still for half a minute.

@@ -23,7 +23,7 @@ def absent(tmp_path):
     return path
 
 
-def test_absent_devices_are_red_with_what_to_check_and_exit_with_5(lce_rig, absent, tmp_path, monkeypatch):
+def test_doctor_absent_devices_exit_with_5(lce_rig, absent, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     done = lce_rig("doctor", "--rig", absent, "--duration", "1", "-o", tmp_path / "session")
     assert done.code == 5

@@ -46,7 +46,7 @@ def coloured(picture, colour):
     return int(np.all(np.abs(picture.astype(int) - colour) < 20, axis=-1).sum())
 
 
-def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
+def test_check_json_has_event_figures(lce_rig, moving):
     document = json.loads(lce_rig("check", moving, "--json").out)
     (pair,) = [pair for pair in document["pairs"] if pair["channel"] == "events"]
     for capture in pair["captures"].values():
@@ -55,7 +55,7 @@ def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
         assert 0 < capture["image"]["smear_m"] < 0.01
 
 
-def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
+def test_check_debug_images_show_events(lce_rig, moving):
     assert lce_rig("check", moving, "--debug-images").code == 0
     drawn = cv2.imread(str(moving / "debug" / "davis.events.lidar" / "000000.png"))
     frame = cv2.imread(str(moving / "debug" / "davis.frames.lidar" / "000000.png"))

@@ -58,7 +58,7 @@ def test_a_failed_result_does_not_reach_a_robot(lce_rig, calibrated, tmp_path):
     assert robot.read_text() != ROBOT
 
 
-def test_files_fit_into_the_robots_tree_and_what_is_left_out_is_told(lce_rig, calibrated, tmp_path, mute):
+def test_export_fits_the_robot_tree(lce_rig, calibrated, tmp_path, mute):
     robot, out = tmp_path / "robot.urdf", tmp_path / "out"
     robot.write_text(ROBOT)
     told = lce_rig("export", calibrated, "-o", out, "--formats", "autoware")

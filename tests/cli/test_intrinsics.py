@@ -20,7 +20,7 @@ def few(simulated, tmp_path_factory):
 
 
 @pytest.mark.long
-def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_path):
+def test_intrinsics_force_saves_the_lens(lce_rig, few, tmp_path):
     refused = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml")
     assert refused.code == 7
     assert not (tmp_path / "new.yaml").exists()
@@ -39,7 +39,7 @@ def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_p
     assert lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml").code == 2, "it exists"
 
 
-def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
+def test_intrinsics_json_names_a_stale_lens(lce_rig, few):
     profile = few / "rig.yaml"
     right = profile.read_text()
     profile.write_text(
@@ -81,7 +81,7 @@ def test_too_few_captures_exit_with_6(lce_rig, session):
     assert "3 of 3 captures" in outcome.err
 
 
-def test_a_lidars_errors_are_printed_and_written_to_a_profile_or_refused(lce_rig, simulated, few, tmp_path):
+def test_lidar_intrinsics_saved_or_refused(lce_rig, simulated, few, tmp_path):
     refused = lce_rig("lidar-intrinsics", few)
     assert refused.code == 6
     new = tmp_path / "new.yaml"

@@ -79,7 +79,8 @@ SAID = STATE._replace(
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (120, 40)])
-def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width, height):
+def test_live_view_long_text_is_not_cut(width, height):
+    """A wide terminal has a larger drawing."""
     lines = drawn(SAID, width=width, height=height)
     assert len(lines) <= height and max(len(line) for line in lines) <= width
     # Beside each other stand the streams' columns, and the bars and the drawing.
@@ -91,14 +92,14 @@ def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width, heig
     assert drawing.index("┐") - drawing.index("┌") >= (20 if height == 24 else 0.45 * width)
 
 
-def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same():
+def test_live_view_empty_state_is_drawn():
     nothing = {"drawing": None, "coverage": None, "sigma_deg": np.nan, "sigma_mm": np.nan, "hold_s": None}
     assert "HOLD STILL" in "\n".join(drawn(STATE._replace(streams=(), **nothing)))
     beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
     assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
 
 
-def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time():
+def test_bell_capture_once_refusal_twice():
     clock = [0.0]
     rung = []
 
@@ -154,7 +155,7 @@ def test_plain_lines_say_what_changes_once(capsys):
     assert tuple(lines[3:]) == told
 
 
-def test_the_drawing_keeps_its_size_when_the_first_prediction_arrives():
+def test_live_view_drawing_keeps_its_size():
     before = STATE._replace(goes_on="", notes=("boards must stand still: no sync board",), log=())
     after = before._replace(goes_on="captures to go: 10 (minimum 6, below 0.18 deg, 9 mm)")
     borders = [[line.find("┌") for line in drawn(state)] for state in (before, after)]

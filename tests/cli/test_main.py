@@ -78,7 +78,7 @@ sys.exit(run(words))
 """
 
 
-def test_ctrl_c_while_open3d_is_imported_is_an_interrupt_and_no_bug(tmp_path):
+def test_main_interrupt_in_open3d_exits_130(tmp_path):
     # Stopped in its initialisation, it would complain of lost memory and end the process with 1.
     words = ["open3d.pybind", "0.2", "simulate", "--rig", "rles", tmp_path / "session", "--captures", "1"]
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
@@ -86,7 +86,7 @@ def test_ctrl_c_while_open3d_is_imported_is_an_interrupt_and_no_bug(tmp_path):
     assert len(done.stderr.split("\n")) == 3 and done.stderr.startswith("\ninterrupted")
 
 
-def test_ctrl_c_while_onnxruntime_is_imported_is_not_taken_for_a_missing_package(tmp_path):
+def test_main_interrupt_in_onnx_exits_130(tmp_path):
     words = ["onnxruntime.capi.onnxruntime_pybind11_state", "0.01", "reconstruct", "none", "-o", tmp_path]
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
     assert done.returncode == 130

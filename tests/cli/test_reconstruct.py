@@ -28,7 +28,7 @@ def recording(path, duration_s=1.2):
     return path
 
 
-def test_images_and_their_timestamps_are_written_and_skipped_ones_are_counted(lce_rig, tmp_path):
+def test_reconstruct_writes_images_stamps(lce_rig, tmp_path):
     outcome = lce_rig("reconstruct", recording(tmp_path / "sweep.aedat4"), "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
     lines = (tmp_path / "out" / "stamps.csv").read_text().splitlines()
@@ -39,16 +39,14 @@ def test_images_and_their_timestamps_are_written_and_skipped_ones_are_counted(lc
 
 
 @pytest.mark.parametrize(("duration_s", "words", "code"), [(0.1, (), 5), (1.2, ("--start", 60), 2)])
-def test_a_recording_too_short_for_an_image_is_refused_and_nothing_is_written(
-    lce_rig, tmp_path, duration_s, words, code
-):
+def test_reconstruct_too_short_is_refused(lce_rig, tmp_path, duration_s, words, code):
     path = recording(tmp_path / "short.aedat4", duration_s)
     assert lce_rig("reconstruct", path, "-o", tmp_path / "out", *words).code == code
     assert lce_rig("reconstruct", tmp_path, "-o", tmp_path / "out").code == 5, "no events in a folder"
     assert not (tmp_path / "out").exists()
 
 
-def test_a_part_of_a_recording_gives_pictures_like_those_of_the_whole_there(lce_rig, tmp_path):
+def test_reconstruct_part_matches_whole(lce_rig, tmp_path):
     path = recording(tmp_path / "sweep.aedat4", 2.6)
     assert lce_rig("reconstruct", path, "-o", tmp_path / "whole").code == 0
     words = ["reconstruct", path, "-o", tmp_path / "part", "--start", 1.6, "--duration", 0.3]
@@ -70,7 +68,7 @@ def stamps(folder):
     return [int(line.split(",")[1]) for line in (folder / "stamps.csv").read_text().splitlines()[1:]]
 
 
-def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
+def test_reconstruct_wild_stamp_is_refused(lce_rig, tmp_path):
     t_ns, places = np.array([0, 10**6, 10**18]), np.array([1, 2, 3], np.uint16)
     write_aedat4(tmp_path / "a.aedat4", [Events("events", t_ns, places, places, places > 1, 346, 260)])
     outcome = lce_rig("reconstruct", tmp_path / "a.aedat4", "-o", tmp_path / "out")

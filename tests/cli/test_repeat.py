@@ -63,7 +63,7 @@ def test_sessions_that_agree_begin_with_a_line_that_says_so(lce_rig, made):
     assert pair["finding"]["text"][1:] in outcome.out.splitlines()[0]
 
 
-def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, made):
+def test_repeat_disagreement_exits_with_7(lce_rig, made):
     sessions = [
         made("monday", [0] * 6),
         made("tuesday", [0.001] * 6),
@@ -100,7 +100,8 @@ def test_a_copy_and_a_picture_in_two_sessions_make_them_one(lce_rig, made, tmp_p
         assert "monday" in outcome.err and other in outcome.err
 
 
-def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):
+def test_repeat_other_rig_or_lens_is_refused(lce_rig, made):
+    """Another board gives a note only."""
     a = made("monday", [0] * 6)
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
     refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))
@@ -113,14 +114,14 @@ def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(l
     assert found["figures"] == {"first": "monday"}
 
 
-def test_a_calibration_that_failed_by_itself_is_not_vouched_for(lce_rig, made):
+def test_repeat_failed_calibration_is_error(lce_rig, made):
     sessions = made("monday", [0] * 6), made("bad", [0] * 6, verdict="fail")
     (found,) = compared(lce_rig, *sessions, code=7)["findings"]
     assert (found["code"], found["severity"], found["subject"]) == ("repeat.failed", "error", "bad")
     assert found["figures"] == {"camera": "davis", "lidar": "lidar"}
 
 
-def test_sensors_of_one_session_only_leave_nothing_to_compare(lce_rig, made):
+def test_repeat_no_common_sensor_is_refused(lce_rig, made):
     outcome = lce_rig("repeat", made("monday", [0] * 6), made("rear", [0] * 6, lidar="rear"))
     assert outcome.code == 4
     assert "monday:" in outcome.err and "rear:" in outcome.err
@@ -148,7 +149,7 @@ def test_a_damaged_result_names_its_file(lce_rig, made):
 
 
 @pytest.mark.long
-def test_simulated_sessions_agree_if_the_sensors_are_mounted_alike_and_disagree_if_not(lce_rig, tmp_path):
+def test_repeat_simulated_finds_moved_sensor(lce_rig, tmp_path):
     monday, tuesday, other = (tmp_path / name for name in ("monday", "tuesday", "other"))
     for session, seed, mounting in ((monday, 1, ()), (tuesday, 2, ("--mounting", "1")), (other, 3, ())):
         made = lce_rig("simulate", "--rig", "rles", session, "--captures", "8", "--seed", seed, *mounting)

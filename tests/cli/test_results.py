@@ -39,9 +39,8 @@ def test_a_named_result_leaves_the_current_one_alone(lce_rig, calibrated):
     assert found["paper"]["pairs"][0]["sigma_rotation_deg"] == saved["sigma_rotation_deg"]
 
 
-def test_results_of_one_session_are_compared_with_a_bound_that_holds_for_any_correlation(
-    lce_rig, two_results
-):
+def test_repeat_of_one_session_agrees(lce_rig, two_results):
+    """The bound holds for any correlation of the two results."""
     outcome = lce_rig("repeat", two_results, "--json")
     assert outcome.code == 0, outcome.err
     (pair,) = json.loads(outcome.out)["pairs"]
@@ -66,7 +65,7 @@ def test_results_that_contradict_each_other_exit_with_7(lce_rig, two_results):
     assert json.loads(outcome.out)["pairs"][0]["finding"]["code"] == "repeat.disagree"
 
 
-def test_results_without_their_captures_and_unreadable_ones_are_listed_as_such(lce_rig, two_results):
+def test_results_outdated_broken_are_listed(lce_rig, two_results):
     used = json.loads((two_results / "results/paper/result.json").read_text())["pairs"][0]["captures_used"]
     assert not listed(lce_rig, two_results)["paper"]["is_outdated"]
     assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
@@ -80,14 +79,14 @@ def test_results_without_their_captures_and_unreadable_ones_are_listed_as_such(l
 
 
 @pytest.mark.parametrize("name", ["../x", "current", "previous", "", "a/b", "x" * 65])
-def test_a_name_that_cannot_be_one_is_refused_before_anything_is_written(lce_rig, session, name):
+def test_calibrate_bad_name_is_refused(lce_rig, session, name):
     before = sorted(path.name for path in session.rglob("*"))
     assert lce_rig("calibrate", session, "--name", name).code == 2
     assert sorted(path.name for path in session.rglob("*")) == before
 
 
 @pytest.mark.long
-def test_overlays_are_drawn_beside_a_named_result_and_move_with_it(lce_rig, two_results):
+def test_overlays_move_with_a_named_result(lce_rig, two_results):
     folder = two_results / "results" / "paper"
     assert lce_rig("verify", two_results, "--name", "paper").code == 0
     used = json.loads((folder / "result.json").read_text())["pairs"][0]["captures_used"]

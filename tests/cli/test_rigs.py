@@ -18,7 +18,7 @@ def test_called_bare_it_lists_the_profiles(capsys):
     assert capsys.readouterr().out == out
 
 
-def test_show_prints_what_is_not_default_and_with_all_everything(capsys, tmp_path):
+def test_rigs_show_omits_defaults(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(f"{find_profile('rles').read_text(encoding='utf-8')}\nquality: {{min_rings: 7}}\n")
     assert run(["rigs", "show", str(path)]) == 0

@@ -15,7 +15,7 @@ def read(path):
     return json.loads(path.read_text())
 
 
-def test_check_counts_usable_captures_and_explains_them_in_a_row_each(lce_rig, simulated):
+def test_check_explain_has_a_row_per_capture(lce_rig, simulated):
     outcome = lce_rig("check", simulated)
     assert outcome.code == 0 and len((outcome.out + outcome.err).splitlines()) <= 3
     assert "16 of 16 captures" in outcome.out
@@ -25,7 +25,7 @@ def test_check_counts_usable_captures_and_explains_them_in_a_row_each(lce_rig, s
     assert first["is_usable"] and first["lidar"]["n_rings"] >= 4 and first["image"]["distance_m"] > 1
 
 
-def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session):
+def test_calibrate_simulated_matches_truth(lce_rig, session):
     outcome = lce_rig("calibrate", session, "--reference", session / "truth.json", "--json")
     assert outcome.code == 0, outcome.err
     pair = json.loads(outcome.out)["pairs"][0]
@@ -38,7 +38,7 @@ def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session)
     assert {"result.json", "report.html", "extrinsics.yaml", "rles.urdf", "static_transforms.txt"} <= names
 
 
-def test_a_result_fits_twelve_lines_of_a_terminal_and_explains_itself_if_asked(lce_rig, calibrated):
+def test_calibrate_output_fits_twelve_lines(lce_rig, calibrated):
     first = (calibrated / "calibration" / "result.json").read_bytes()
     brief = lce_rig("calibrate", calibrated)
     assert (calibrated / "calibration" / "result.json").read_bytes() == first
@@ -73,7 +73,7 @@ def test_the_result_names_its_robot_sensors_and_date(lce_rig, session):
 
 
 @pytest.mark.long
-def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, session):
+def test_result_hashes_match_sha256sum(lce_rig, session):
     printed = json.loads(lce_rig("calibrate", session, "--json").out)
     document = read(session / "calibration" / "result.json")
     assert printed["inputs_sha256"] == document["inputs_sha256"]
@@ -111,7 +111,7 @@ def test_verify_draws_every_capture_and_one_page(lce_rig, calibrated):
     assert pictures == [*(f"{k:06d}.png" for k in range(16)), "index.html"]
 
 
-def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, calibrated_few):
+def test_verify_contradicted_result_fails(lce_rig, calibrated_few):
     path = calibrated_few / "calibration" / "result.json"
     result = read(path)
     result["pairs"][0]["T_cam_lidar"][2][3] += 0.12
@@ -133,7 +133,7 @@ def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated_few
     assert not any(figures["was_used"] for figures in pair["captures"].values())
 
 
-def test_a_run_without_result_leaves_the_earlier_one_untouched(lce_rig, calibrated_few):
+def test_calibrate_failed_keeps_old_result(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
     folder = calibrated_few / "calibration"
     before = contents(folder)
@@ -143,7 +143,7 @@ def test_a_run_without_result_leaves_the_earlier_one_untouched(lce_rig, calibrat
     assert contents(folder) == before
 
 
-def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, calibrated_few):
+def test_verify_again_keeps_user_files(lce_rig, calibrated_few):
     folder = calibrated_few / "calibration" / "overlays"
     for path in ("notes.txt", "for-the-paper.png", "report/text.md", "cam.frames.lidar/notes.txt"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -156,9 +156,7 @@ def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, cali
 
 
 @pytest.mark.long
-def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
-    lce_rig, calibrated_few, tmp_path
-):
+def test_verify_other_result_keeps_overlays(lce_rig, calibrated_few, tmp_path):
     lce_rig("verify", calibrated_few)
     own = calibrated_few / "calibration" / "overlays" / "000000.png"
     before = own.read_bytes()
@@ -172,7 +170,8 @@ def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
 
 
 @pytest.mark.long
-def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_rig, session):
+def test_calibrate_far_from_nominal_fails(lce_rig, session):
+    """Extrinsics are exported with --force only."""
     profile = session / "rig.yaml"
     document = yaml.safe_load(profile.read_text())
     nominal = document["nominal_extrinsics"][0]
@@ -194,7 +193,7 @@ def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_ri
     assert "NOT FOR" in (session / "calibration" / "extrinsics.yaml").read_text()
 
 
-def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, session):
+def test_too_few_captures_name_the_minimum(lce_rig, session):
     for k in range(4, 16):
         shutil.rmtree(session / "captures" / f"{k:06d}")
     for verb in ("calibrate", "check"):

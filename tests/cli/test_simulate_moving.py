@@ -103,7 +103,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig, tmp_path):
         *(("--duration", value, "--recording", "r") for value in ("nan", "inf", "-0.1")),
     ],
 )
-def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(lce_rig, tmp_path, monkeypatch, words):
+def test_simulate_bad_choices_exit_with_2(lce_rig, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     outcome = lce_rig("simulate", "--rig", "rles", *words)
     assert outcome.code == 2

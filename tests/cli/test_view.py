@@ -9,7 +9,7 @@ def _no_display(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_without_a_display_it_exits_with_5_and_names_the_option(lce_rig, calibrated):
+def test_view_without_display_exits_with_5(lce_rig, calibrated):
     outcome = lce_rig("view", calibrated)
     assert outcome.code == 5
     assert "--output" in outcome.err

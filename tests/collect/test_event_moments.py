@@ -59,7 +59,7 @@ def off_truth(T_cam_board, stamp_ns):
     return float(np.linalg.norm(T_cam_board[:3, 3] - truth[:3, 3])), float(min(turns))
 
 
-def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(collected):
+def test_collect_slow_board_has_its_events(collected):
     session, report = collected
     assert report.captured == ["000000"] and not report.errors and report.has_events
     (capture,) = session.captures
@@ -78,7 +78,7 @@ def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(
     assert 1 < capture.meta["events_px"] < 50
 
 
-def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(tmp_path, collected, lidar):
+def test_collect_davis_file_equals_bag(tmp_path, collected, lidar):
     frames = [s for s in moves.samples() if isinstance(s, Image)]
     raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
     file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
@@ -93,7 +93,7 @@ def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(tmp
     assert (again.captured, again.n_known) == ([], 1)
 
 
-def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_path, lidar):
+def test_collect_events_only_keeps_no_image(tmp_path, lidar):
     write_aedat4(tmp_path / "events.aedat4", _with_hot_pixels(moves.events()))
     session, report = run(tmp_path / "s", lidar, tmp_path / "events.aedat4")
     assert report.captured == ["000000"]
@@ -130,7 +130,7 @@ def _with_hot_pixels(packets):
     return mixed
 
 
-def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says_so(tmp_path, lidar):
+def test_collect_torn_file_keeps_captures(tmp_path, lidar):
     frames = [s for s in moves.samples() if isinstance(s, Image)]
     raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
     file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
@@ -159,6 +159,6 @@ def test_captures_whose_events_begin_late_are_kept(tmp_path):
     assert session.captures[0].events("davis").t_ns[0] >= start_ns
 
 
-def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path):
+def test_collect_no_events_needs_still_board(tmp_path):
     _, report = run(tmp_path / "s", moves.bag(tmp_path / "a.bag", moves.without(Events)))
     assert report.captured == [] and not report.has_events

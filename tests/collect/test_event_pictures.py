@@ -38,7 +38,7 @@ def pictures(samples, rig, tally=None):
     return [sample for sample in found if isinstance(sample, Image)]
 
 
-def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(rig):
+def test_event_images_match_whole_stream(rig):
     given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
     passed = list(with_event_pictures(given, rig, ["davis"], Losses()))
     assert [s for s in passed if not isinstance(s, Image)] == given
@@ -51,7 +51,7 @@ def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(rig):
 
 
 @pytest.mark.parametrize("late_ms", [120, 700])
-def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig, late_ms):
+def test_event_images_late_scans_are_equal(rig, late_ms):
     whole = replace(
         EVENTS[0],
         **{n: np.concatenate([getattr(e, n) for e in EVENTS]) for n in ("t_ns", "x", "y", "polarity")},
@@ -65,7 +65,7 @@ def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig, late
     assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(late, prompt, strict=True))
 
 
-def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig):
+def test_event_images_early_scans_counted(rig):
     tally = Losses()
     scans = [scan(t) for t in range(-2950, 800, 100)]
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
@@ -74,7 +74,7 @@ def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig):
     assert counts == {"read.no_events_at_scan": 30, "read.network_settling": 7}
 
 
-def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig):
+def test_event_images_clock_set_back_skipped(rig):
     tally = Losses()
     given = [*EVENTS[:30], scan(1050), scan(1150), *EVENTS[30:], scan(550), scan(1950)]
     found = pictures(given, rig, tally)

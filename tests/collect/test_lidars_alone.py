@@ -74,7 +74,7 @@ def recorded(boards: list[Array], late_ns: int = 20_000_000) -> Recording:
     return Recording(sorted(scans, key=lambda scan: scan.stamp_ns or 0))
 
 
-def test_a_recording_gives_a_capture_of_both_where_the_plate_stands(tmp_path: Path, rig: Rig) -> None:
+def test_collect_still_plate_gives_a_capture(tmp_path: Path, rig: Rig) -> None:
     stood = [place(2.5, 15, 45, yaw) for yaw in (20, -20) for _ in range(8)]
     with Session.create(tmp_path / "s", rig) as session:
         report = collect(session, [recorded(stood)])
@@ -84,7 +84,7 @@ def test_a_recording_gives_a_capture_of_both_where_the_plate_stands(tmp_path: Pa
     assert not again.captured and again.n_known == 2
 
 
-def test_python_reads_two_recordings_each_by_its_own_options(tmp_path: Path, rig: Rig) -> None:
+def test_collect_from_takes_options_per_bag(tmp_path: Path, rig: Rig) -> None:
     scans, names = recorded([place(2.5, 15, 45, 20)] * 8).samples_read, ("left", "right")
     bags, sources = [], []
     for name in names:
@@ -102,7 +102,8 @@ def test_python_reads_two_recordings_each_by_its_own_options(tmp_path: Path, rig
         lce.collect_from(rig, bags, tmp_path / "t", sources=sources[:1])
 
 
-def test_a_plate_that_moves_or_is_not_in_both_scans_is_no_capture(tmp_path: Path, rig: Rig) -> None:
+def test_collect_moving_plate_is_skipped(tmp_path: Path, rig: Rig) -> None:
+    """A plate that only one LiDAR sees gives no capture either."""
     moved = [place(2.0 + 0.06 * k, 15, 45, 20) for k in range(14)]
     with Session.create(tmp_path / "s", rig) as session:
         assert not collect(session, [recorded(moved)]).captured
@@ -119,9 +120,7 @@ def test_scans_of_one_lidar_are_refused_with_what_to_add(tmp_path: Path, rig: Ri
 
 
 @pytest.mark.parametrize("above", ["", "pcd"])
-def test_folders_named_after_the_lidars_are_matched_by_file_name(
-    tmp_path: Path, rig: Rig, above: str
-) -> None:
+def test_collect_lidar_folders_match_by_name(tmp_path: Path, rig: Rig, above: str) -> None:
     folder = tmp_path / "recording"
     for k in range(3):
         for scan in scan_both(place(2.5, 15, 45, 10 * k), k):

@@ -31,7 +31,7 @@ def collected(tmp_path_factory, bag, rig):
     return path, report
 
 
-def test_two_stands_become_two_captures_and_the_way_between_none(collected):
+def test_collect_each_stand_is_captured_once(collected):
     path, report = collected
     captures = Session.open(path).captures
     assert report.captured == [c.name for c in captures] == ["000000", "000001"]
@@ -46,7 +46,7 @@ def test_two_stands_become_two_captures_and_the_way_between_none(collected):
         np.testing.assert_allclose(scan.points, shown.scans[0].points, atol=1e-6)
 
 
-def test_a_rejected_placement_is_not_captured_again_from_its_recording(collected, bag, rig, tmp_path):
+def test_collect_rejected_is_not_taken_again(collected, bag, rig, tmp_path):
     shutil.copytree(collected[0], tmp_path / "s")
     with Session.resume(tmp_path / "s", rig) as session:
         session.reject("000001")
@@ -55,7 +55,7 @@ def test_a_rejected_placement_is_not_captured_again_from_its_recording(collected
 
 
 @pytest.mark.long
-def test_a_recording_stops_at_the_target_or_says_what_is_missing(tmp_path, bag, rig):
+def test_collect_target_reached_or_missing(tmp_path, bag, rig):
     with Session.create(tmp_path / "one", rig) as session:
         report = collect(session, [open_recording(bag, rig)], n_wanted=1)
     assert (len(report.captured), report.n_missing) == (1, 0)
@@ -64,7 +64,7 @@ def test_a_recording_stops_at_the_target_or_says_what_is_missing(tmp_path, bag, 
     assert (len(session.captures), report.n_missing) == (2, 3)
 
 
-def test_a_torn_bag_gives_the_captures_before_the_damage_and_an_error(tmp_path, write_bag, rig):
+def test_collect_torn_bag_keeps_captures(tmp_path, write_bag, rig):
     bag = write_bag(tmp_path / "torn.bag", VISIT)
     damaged = bytearray(bag.read_bytes())
     place = damaged.index(b"op=\2", int(0.45 * len(damaged)))
@@ -88,7 +88,7 @@ def test_a_board_that_never_stands_still_is_never_captured(tmp_path, write_bag, 
         assert collect(session, [open_recording(bag, loose)]).captured
 
 
-def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, write_bag, rig):
+def test_collect_offset_clocks_need_profile(tmp_path, write_bag, rig):
     bag = write_bag(tmp_path / "a.bag", [0] * 9, lag_ns=3 * 10**9)
     with Session.create(tmp_path / "apart", rig) as session, pytest.raises(SourceError) as caught:
         collect(session, [open_recording(bag, rig)])

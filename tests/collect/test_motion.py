@@ -46,21 +46,19 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rles):
         (0.0, 8.0, 100.0, "image.flicker"),
     ],
 )
-def test_boards_without_use_for_an_event_camera_are_refused_by_their_cause(
-    rles, speed_mps, rate, lamp_hz, code
-):
+def test_motion_useless_boards_are_refused(rles, speed_mps, rate, lamp_hz, code):
     stream = event_stream([(-1.3, 3.0, rate)], lamp_hz=lamp_hz)
     detections = watch(rles, lambda t: (speed_mps * (t - 0.5), 0.0), 1.0, stream)
     assert choose(detections, rles) == ([], {code: 10})
 
 
-def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rles):
+def test_motion_plenty_of_events_is_accepted(rles):
     moments, refused = choose(watch(rles, lambda _t: (0.0, 0.0), 2.0, PLENTY), rles)
     assert len(moments) == 1 and not refused
     assert moments[0].figures["speed_mps"] < 0.01 and moments[0].figures["events_px"] > 4
 
 
-def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rles):
+def test_motion_slowest_part_is_preferred(rles):
     def way(t):
         """In at 0.4 m/s, then on at 0.1 m/s."""
         return (0.4 * (t - 1.0) if t < 1.0 else 0.1 * (t - 1.0), 0.0)
@@ -97,7 +95,7 @@ def test_a_board_that_comes_back_is_not_taken_twice(rles):
     assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15
 
 
-def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rles):
+def test_motion_unseen_board_names_the_cause(rles):
     lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=60.0)
     unseen = Refusal("image.no_board")
     for stream, code in [(lit, "image.flicker"), (event_stream([(-1.3, 3.0, 0.3)]), "image.hardly_moved")]:
@@ -113,9 +111,7 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rles
     ("markers", "is_turned", "is_still"),
     [("charuco", False, True), ("charuco", True, False), ("checkerboard", True, True)],
 )
-def test_markers_tell_a_turned_board_from_a_still_one_and_need_no_neighbours(
-    rles, markers, is_turned, is_still
-):
+def test_stillness_markers_detect_a_turn(rles, markers, is_turned, is_still):
     board = Board(8, 6, 0.07, 0.767, 0.626)
     corners_px = 100 + 400 * board.corners()[:, :2]
     if markers == "charuco":

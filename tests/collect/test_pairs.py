@@ -51,7 +51,7 @@ def run(session, folder, rig, **options):
     return collect(session, [open_recording(folder, rig)], **options)
 
 
-def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folder, rig):
+def test_collect_pairs_second_run_adds_none(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     assert report.captured == [f"{k:06d}" for k in range(N_PAIRS)]
@@ -85,7 +85,7 @@ def test_the_same_data_in_another_file_is_a_duplicate(tmp_path, folder, rig):
     assert (report.n_known, len(report.captured)) == (1, N_PAIRS)
 
 
-def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp_path, folder, rig):
+def test_collect_damaged_pairs_are_refused(tmp_path, folder, rig):
     os.truncate(folder / "img" / "00001.png", 5000)
     os.truncate(folder / "pcd" / "00002.pcd", 5000)
     with Session.create(tmp_path / "s", rig) as session:
@@ -96,7 +96,7 @@ def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp
     assert {refusal.stage for refusal in report.refused.values()} == {"read"}
 
 
-def test_a_folder_of_which_nothing_can_be_read_is_an_error_that_names_the_first_file(tmp_path, folder, rig):
+def test_collect_unreadable_folder_is_error(tmp_path, folder, rig):
     for path in (folder / "pcd").iterdir():
         os.truncate(path, 0)
     with Session.create(tmp_path / "s", rig) as session, pytest.raises(SourceError, match=r"pcd/00000\.pcd"):
@@ -126,7 +126,7 @@ with Session.resume(sys.argv[1], rig) as session:
 """
 
 
-def test_killed_runs_end_up_with_the_same_captures_as_one_that_was_not(tmp_path, folder):
+def test_collect_killed_runs_lose_no_capture(tmp_path, folder):
     rig = load_rig("rlfs")
     with Session.create(tmp_path / "whole", rig) as whole:
         run(whole, folder, rig)

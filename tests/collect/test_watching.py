@@ -39,13 +39,14 @@ def nearest_m(detection, k):
     return float(min(np.linalg.norm(each - image.T_cam_board[:3, 3]) for each in seen))
 
 
-def test_a_board_that_jumps_is_found_in_the_scan_long_before_the_next_search_is_due():
+def test_track_jumped_board_is_found_early():
+    """The next full search is not due for 1000 s."""
     watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     for k, time_s in ((0, 0.0), (0, 0.1), (0, 0.5), (1, 0.9), (1, 1.0), (2, 1.4)):
         assert nearest_m(see(watcher, k, time_s), k) < 0.3, (k, time_s)
 
 
-def test_a_board_that_was_out_of_sight_is_searched_for_at_once():
+def test_track_board_out_of_sight_is_sought():
     watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     assert nearest_m(see(watcher, 0, 0.0), 0) < 0.3
     capture = placements()[0]
@@ -72,7 +73,7 @@ def strict(**limits):
     return changed(rig(), quality=changed(rig().quality, **limits))
 
 
-def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment():
+def test_track_unfit_board_is_never_a_moment():
     watcher = BoardTracker(strict(min_square_px=1000.0))
     seen = [see(watcher, 0, 0.1 * k) for k in range(30)]
     assert all(("davis", "frames") in each.images for each in seen)
@@ -83,7 +84,8 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment():
     assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 
-def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not():
+def test_moments_single_shots_are_taken():
+    """Samples that pass within a moving sequence are not."""
     watcher = BoardTracker(rig())
     times_s = (0.0, 4.0, 8.0, 8.1, 12.0)
     seen = [see(watcher, k % len(placements()), time_s) for k, time_s in enumerate(times_s)]
@@ -107,7 +109,7 @@ def test_live_and_offline_take_the_same_boards():
                 assert ("lidar" in detection.lidars) != isinstance(scan, Refusal)
 
 
-def test_a_moment_is_confirmed_by_the_search_that_check_makes():
+def test_confirm_moment_searches_thoroughly():
     watcher = BoardTracker(rig())
     for time_s in (0.0, 0.1, 0.2):
         detection = see(watcher, 0, time_s)
@@ -122,7 +124,8 @@ def test_a_moment_is_confirmed_by_the_search_that_check_makes():
     assert isinstance(refused, Refusal) and refused.stage == "image"
 
 
-def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted():
+def test_confirm_other_plate_is_refused():
+    """The nominal extrinsics fitted before."""
     watcher = BoardTracker(rig())
     whole = see(watcher, 0, 0.0)
     (scan,) = whole.frame.scans

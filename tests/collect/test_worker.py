@@ -47,7 +47,7 @@ def adder():
         yield opened
 
 
-def test_arrays_arrive_whole_and_are_not_overwritten_by_the_next(adder):
+def test_worker_arrays_are_not_overwritten(adder):
     first = np.arange(300_000, dtype=np.uint16).reshape(300, 1000)
     assert adder.call("add", first) == 5 + int(first.sum())
     adder.call("add", np.zeros_like(first))
@@ -59,12 +59,12 @@ def two_threads(monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
 
 
-def test_it_runs_in_another_process_that_computes_in_one_thread(two_threads, adder):
+def test_worker_is_a_process_of_one_thread(two_threads, adder):
     assert adder.call("process") != os.getpid()
     assert adder.call("threads") == "1" and os.environ["OPENBLAS_NUM_THREADS"] == "2"
 
 
-def test_errors_of_the_user_arrive_as_they_are_and_bugs_as_bugs(adder):
+def test_worker_errors_and_bugs_pass_through(adder):
     with pytest.raises(ProfileError) as caught:
         adder.call("refuse")
     assert (caught.value.what, caught.value.hint) == ("what", "hint")
@@ -72,7 +72,8 @@ def test_errors_of_the_user_arrive_as_they_are_and_bugs_as_bugs(adder):
         adder.call("fail")
 
 
-def test_a_process_that_was_killed_is_started_again_and_one_that_always_dies_is_an_error():
+def test_worker_killed_process_is_restarted():
+    """A process that dies in every call is an error."""
     with Worker("add", Adder, 7) as opened:
         os.kill(opened.call("process"), signal.SIGKILL)
         assert opened.call("add", np.ones(3)) == 10

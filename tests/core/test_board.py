@@ -12,7 +12,7 @@ from lce_rig.core.pattern import dark_rectangles, is_dark, markers_of
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626, pattern_offset_m=(0.002, -0.001))
 
 
-def test_corners_run_row_by_row_from_the_top_left_around_the_pattern_offset():
+def test_corners_run_in_rows_from_top_left():
     corners = BOARD.corners()
     assert corners.shape == (48, 3)
     np.testing.assert_allclose(corners.mean(axis=0), [0.002, -0.001, 0], atol=1e-12)
@@ -27,7 +27,7 @@ APRILGRID = Board(
 
 
 @pytest.mark.parametrize("board", [BOARD, CHARUCO, APRILGRID], ids=lambda board: board.type)
-def test_the_print_is_its_dark_rectangles_and_has_a_crossing_at_every_corner(board):
+def test_pattern_dark_areas_meet_at_corners(board):
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (4000, 2))
     left, lower, width, height = dark_rectangles(board).T
     x, y = points[:, :1], points[:, 1:]

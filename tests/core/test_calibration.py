@@ -240,7 +240,8 @@ def test_findings_of_another_version_keep_their_words(tmp_path):
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_any_prefix_or_flipped_bit_gives_an_error_or_a_result(tmp_path, data):
+def test_result_damaged_gives_session_error(tmp_path, data):
+    """Any beginning and any flipped bit: a result or a SessionError."""
     path = tmp_path / "result.json"
     path.write_bytes(data.draw(damaged(as_text(full()).encode())))
     try:

@@ -49,7 +49,7 @@ def test_points_behind_the_camera_are_not_drawn(camera):
     assert np.isnan(pixels[:2]).all()
 
 
-def test_points_folded_back_by_the_distortion_polynomial_are_not_drawn():
+def test_camera_folded_points_are_excluded():
     import cv2
 
     outside = np.array([[3.0, 0.3, 1.0]])

@@ -66,7 +66,7 @@ def test_velodynes_beams_are_those_of_its_calibration_files(name):
         ("", None),
     ],
 )
-def test_models_are_found_by_any_spelling_and_not_by_half_a_name(spelling, name):
+def test_data_sheet_any_spelling_is_found(spelling, name):
     found = find_data_sheet(spelling)
     assert (found and found.name) == name
 

@@ -26,7 +26,7 @@ PATH = Path("folder/file.bin")
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_any_error_of_a_library_becomes_one_line_that_names_the_file(error):
+def test_library_error_becomes_one_line(error):
     with pytest.raises(ProfileError) as raised, reading(PATH, ProfileError):
         raise error
     assert raised.value.what.startswith(f"{PATH}: ")

@@ -36,5 +36,5 @@ def test_what_is_no_json_is_refused(data):
         parse_json(data)
 
 
-def test_json_is_read_with_or_without_a_mark_of_its_encoding():
+def test_parse_json_skips_byte_order_mark():
     assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, "\\ud83d\\ude00", null]}') == {"a": [1, 2.5, "😀", None]}

@@ -32,16 +32,16 @@ def test_a_figure_that_is_not_finite_reads_as_unknown():
         (0.012, 0.012, 60.0, "error 12 mm (limit 12 mm), tilt 60 deg (60 deg)"),
     ],
 )
-def test_a_figure_is_printed_so_that_it_differs_from_its_limit(error_m, limit_m, tilt_deg, words):
+def test_figure_is_printed_unlike_its_limit(error_m, limit_m, tilt_deg, words):
     assert LIMIT(error_m=error_m, limit_m=limit_m, tilt_deg=tilt_deg, max_tilt_deg=60.0).text == words
 
 
-def test_a_finding_read_from_a_file_keeps_the_words_of_the_file():
+def test_finding_from_file_keeps_its_words():
     found = Finding("t.of_an_old_version", stored=("the text", "the action"))
     assert (found.text, found.advice) == ("the text", "the action")
 
 
-def test_the_worst_finding_decides_and_order_is_kept_otherwise():
+def test_worst_finding_is_ranked_first():
     notes = [Finding("a", "note"), Finding("b", "error"), Finding("c", "warning"), Finding("d", "error")]
     assert worst(notes) == "error" and worst([]) == "note"
     assert [finding.code for finding in ranked(notes)] == ["b", "d", "c", "a"]

@@ -48,7 +48,7 @@ def test_difference_undoes_perturb(phi, t, tangent):
 
 
 @given(vectors, st.floats(1e-10, 3.0))
-def test_the_angle_between_rotations_is_exact_even_when_tiny(phi, angle):
+def test_rotation_angle_tiny_is_exact(phi, angle):
     axis = np.array([0.6, 0.0, 0.8])
     R = exp_so3(phi)
     assert np.isclose(rotation_angle(R @ exp_so3(axis * angle), R), angle, rtol=1e-5, atol=1e-15)

@@ -52,7 +52,7 @@ def running(busy):
 
 
 @pytest.mark.parametrize("busy", BUSY.values(), ids=BUSY)
-def test_whatever_is_going_on_ends_after_a_grace_in_one_line(busy):
+def test_interrupt_busy_ends_after_grace(busy):
     with running(busy) as process:
         pressed_s = time.monotonic()
         process.send_signal(signal.SIGINT)
@@ -74,7 +74,8 @@ def test_who_presses_twice_does_not_wait():
     assert said == INTERRUPTED + "\n"
 
 
-def test_what_must_be_written_first_has_longer_but_not_at_the_second_press():
+def test_interrupt_second_press_exits():
+    """The first press leaves time to write."""
     busy = """
     import signal
     asked = []

@@ -76,7 +76,7 @@ def test_the_covariance_is_what_monte_carlo_scatters(camera, tilt_deg, z_m):
 
 
 @CAMERAS
-def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(camera):
+def test_planar_pose_both_minima_are_found(camera):
     T = looking(20, 75, 10, (0.1, 0.05, 4.0 if camera is RADTAN else 9.0))
     solved = solve(seen(T, camera, 0.2, 1), camera)
     other = solved.T_cam_board_alternative

@@ -29,7 +29,7 @@ def solved(board, corners_px):
 
 
 @pytest.mark.parametrize(("board", "n_quarters"), [(OBLONG, 2), (SQUARE, 1), (SQUARE, 2), (SQUARE, 3)])
-def test_a_board_counted_from_another_end_has_the_same_pose_and_covariance(board, n_quarters):
+def test_turned_board_has_the_same_pose(board, n_quarters):
     reference = seen(board, looking(), 0.1)
     # A tenth of a second later the board has moved and turned a little.
     later = seen(board, perturb(looking(), np.array([0.02, 0.01, 0.0, 0.05, -0.04, 0.03])), 0.1, seed=1)
@@ -41,7 +41,7 @@ def test_a_board_counted_from_another_end_has_the_same_pose_and_covariance(board
     np.testing.assert_allclose(cov, later.cov, rtol=1e-4, atol=1e-12)
 
 
-def test_of_two_poses_the_nearer_one_is_taken_with_the_covariance_it_has():
+def test_nearest_pose_takes_its_covariance():
     truth = looking((0.3, -0.25, 0.4), (0.0, 0.0, 3.5))
     found = seen(OBLONG, truth, 0.2)
     assert found.T_cam_board_alternative is not None

@@ -38,7 +38,7 @@ def test_arrays_that_are_no_detection_are_refused():
         from_arrays({})
 
 
-def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
+def test_detections_pair_shares_captures():
     refusal = Refusal("image.low_contrast")
     images = {
         ("cam", "frames"): {"000000": refusal, "000001": refusal},

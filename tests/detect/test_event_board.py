@@ -57,7 +57,7 @@ def truth_m(stamp_ns):
     return STEADY.shift_px(stamp_ns * 1e-9) / FOCAL_PX * DEPTH_M
 
 
-def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(detection):
+def test_event_board_track_matches_truth(detection):
     picture, board = detection
     assert isinstance(picture, Image) and isinstance(board, ImageBoard)
     assert picture.stamp_ns == board.stamp_ns == STAMP
@@ -103,13 +103,13 @@ def test_events_are_counted_on_the_board_only(stream, detection):
         (lambda _: join(noise(0.3), lamps(100)), "image.flicker", {}),
     ],
 )
-def test_events_that_show_no_board_are_refused_by_their_cause(stream, events, code, figures):
+def test_event_board_none_names_the_cause(stream, events, code, figures):
     board = find(events(stream))[1]
     assert board.code == code
     assert {name: board.figures[name] for name in figures} == figures
 
 
-def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(stream):
+def test_hot_pixels_do_not_hide_the_board(stream):
     rng = np.random.default_rng(2)
     n_each, n_hot = 1_500, 25
     t_us = rng.integers(0, 1_400_000, n_each * n_hot)
@@ -136,17 +136,17 @@ def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code,
     assert (board.code, board.figures[figure]) == (code, *limit.values())
 
 
-def test_a_board_that_moves_far_during_its_scan_of_20_ms_is_too_fast(detection):
+def test_event_board_far_motion_is_too_fast(detection):
     board = gate_event_board(detection[1], LIMITS.model_copy(update={"max_smear_m": 1e-3}))
     assert board.code == "image.too_fast" and board.figures["max_speed_mps"] == pytest.approx(0.05)
 
 
-def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):
+def test_event_gate_without_events_passes(detection):
     bare = find_image_board(detection[0], BOARD, CAMERA, limits=LIMITS, is_from_events=True)
     assert gate_event_board(bare, LIMITS) is bare
 
 
-def test_squares_of_too_few_edge_widths_are_refused_by_the_widest_edge_that_would_do(detection):
+def test_event_board_wide_edges_are_refused(detection):
     limits = LIMITS.model_copy(update={"min_event_sharpness": 50.0})
     refusal = find_image_board(detection[0], BOARD, CAMERA, limits=limits, is_from_events=True)
     assert refusal.code == "image.blurred"

@@ -49,7 +49,8 @@ CASES = [
 
 
 @pytest.mark.parametrize(("board", "camera", "T"), CASES)
-def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(board, camera, T):
+def test_image_board_corners_are_accurate(board, camera, T):
+    """To 0.05 px RMS."""
     result = found(draw(board, camera, T), board, camera)
     truth, _ = camera.project(transform(T, board.corners()))
     error = result.corners_px - truth
@@ -63,7 +64,7 @@ def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(board, camera, T):
 
 
 @pytest.mark.parametrize("roll_deg", range(0, 360, 60))
-def test_the_black_corner_square_tells_how_an_asymmetric_board_is_turned(roll_deg):
+def test_image_board_corner_square_sets_turn(roll_deg):
     T = looking(20, 70, roll_deg, (0.0, 0.0, 1.7))
     result = found(draw(ASYMMETRIC, DAVIS, T), ASYMMETRIC, DAVIS)
     assert np.degrees(rotation_angle(result.T_cam_board[:3, :3], T[:3, :3])) < 1.0
@@ -80,7 +81,7 @@ def test_a_symmetric_board_is_read_with_its_top_row_up(roll_deg):
     assert min(apart) < 1.0
 
 
-def test_a_board_of_ten_grey_values_contrast_in_event_pictures_is_found():
+def test_image_board_low_contrast_is_found():
     T = looking(25, 30, 45, (0.0, 0.0, 1.8))
     pixels = draw(ASYMMETRIC, DAVIS, T, black=105, white=135, noise=2.5)
     assert found(pixels, ASYMMETRIC, DAVIS).quality.contrast == pytest.approx(30, abs=6)
@@ -96,7 +97,7 @@ SHIFTS = [(n, to) for n in (0.2, 0.6, 1.0, 1.4, 2.0) for to in ((1.0, 0.0), (0.0
 
 @pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
 @pytest.mark.parametrize(("n_squares", "direction"), [(0.0, (1.0, 0.0)), *SHIFTS])
-def test_a_board_that_is_followed_is_found_as_if_it_were_not(board, n_squares, direction):
+def test_image_board_followed_equals_search(board, n_squares, direction):
     first = _first_of_following(board)
     shift = n_squares * board.square_m * np.array(direction)
     T_moved = FOLLOWED_FROM.copy()
@@ -118,7 +119,7 @@ def _first_of_a_quick_search(camera, z_m):
     ("camera", "z_m"), [(WIDE, 1.2), (WIDE, 3.0), (DAVIS, 1.6)], ids=["near", "far", "small picture"]
 )
 @pytest.mark.parametrize(("turn_deg", "closer"), [(0, 1.0), (12, 0.9), (-12, 1.1)])
-def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(camera, z_m, turn_deg, closer):
+def test_image_board_quick_search_follows(camera, z_m, turn_deg, closer):
     first = _first_of_a_quick_search(camera, z_m)
     shift_m = 1.5 * ASYMMETRIC.square_m
     T_moved = looking(10, 80, 5 + turn_deg, (shift_m, shift_m, closer * z_m))
@@ -129,7 +130,7 @@ def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(camera, 
     assert np.abs(quick.corners_px - whole.corners_px).max() < 0.15
 
 
-def test_a_board_that_went_far_is_found_in_the_whole_picture():
+def test_image_board_moved_far_is_found():
     pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
     before = found(draw(SYMMETRIC, WIDE, looking(25, 80, 40, (-0.7, 0, 2.2))), SYMMETRIC, WIDE)
     result = find_image_board(picture(pixels), SYMMETRIC, WIDE, last=before)
@@ -152,7 +153,8 @@ def test_wrong_inner_corners_are_named_with_those_seen(board, camera, T, step):
     }
 
 
-def test_a_board_of_which_a_part_is_found_because_it_is_far_is_not_taken_for_another():
+def test_image_board_far_part_is_no_other():
+    """The refusal does not name another corner count."""
     pixels = draw(SYMMETRIC, DAVIS, looking(40, 80, 45, (0, 0, 5.2)), seed=2, blur_px=1.2)
     refusal = refused(pixels, SYMMETRIC, DAVIS)
     assert refusal.code == "image.part" and "n_cols_seen" not in refusal.figures
@@ -168,7 +170,7 @@ def test_a_board_cut_off_by_the_border_is_said_to_be():
 
 
 @pytest.mark.long
-def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures():
+def test_image_board_bad_images_are_refused():
     T = looking(20, 30, 40, (0, 0, 1.8))
     noise = np.random.default_rng(0).normal(0, 2, (260, 346))
     stripes = np.where(np.arange(346) // 20 % 2, 200, 40).astype(np.uint8)
@@ -189,14 +191,15 @@ def test_an_empty_event_picture_asks_for_motion():
     assert (result.code, result.action) == ("image.low_contrast", "events")
 
 
-def test_intrinsics_of_another_resolution_are_refused_naming_both_sizes():
+def test_image_board_other_size_is_refused():
     pixels = cv2.resize(draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8))), (692, 520))
     with pytest.raises(ProfileError, match=r"692x520 px.*346x260 px") as raised:
         find_image_board(picture(pixels), ASYMMETRIC, DAVIS)
     assert "by 2" in raised.value.hint
 
 
-def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing():
+def test_image_board_margin_changes_nothing():
+    """Nor does a readout that is cut short."""
     pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
     padded = np.full((480, 640), 128, np.uint8)
     padded[:260, :346] = pixels
@@ -205,7 +208,7 @@ def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing
         assert np.allclose(corners, found(pixels, ASYMMETRIC, DAVIS).corners_px, atol=0.01)
 
 
-def test_intrinsics_of_another_lens_are_refused_by_the_misfit_of_the_corners():
+def test_image_board_other_lens_is_refused():
     pixels = draw(SYMMETRIC, WIDE, looking(30, 40, 40, (-0.5, 0.15, 1.2)))
     wrong = replace(WIDE, distortion=(0.3, 0.0, 0.0, 0.0))
     refusal = refused(pixels, SYMMETRIC, wrong)
@@ -251,7 +254,7 @@ def test_boards_of_recordings_are_found(recordings, name, at_least, median_px):
 
 
 @pytest.mark.dataset
-def test_frames_and_event_pictures_agree_on_how_the_board_is_turned(recordings):
+def test_frames_and_event_images_agree(recordings):
     board, camera, paths = _recording(recordings / "rles02_lf")
     angles = []
     for path in paths:

@@ -65,7 +65,7 @@ def rotated_about_z(scan, deg):
     )
 
 
-def test_what_lies_beyond_the_edges_does_not_depend_on_the_yaw_of_the_lidar():
+def test_lidar_yaw_keeps_what_lies_behind():
     scan = cast([board_plate(place(2.5, 20)), *ROOM], sigma_m=0.01)
     ahead = find(scan)[0]
     # Rings are cut at their first break from azimuth -180 deg on; boards at every angle to it.
@@ -102,7 +102,7 @@ def test_tilted_board_is_found(yaw_deg, pitch_deg):
 
 @pytest.mark.parametrize("yaw_deg", [45, -52, 60])
 @pytest.mark.parametrize("lost", ["nothing", "behind", "both"])
-def test_board_whose_dark_squares_return_nothing_or_from_too_far_is_found_where_expected(yaw_deg, lost):
+def test_lost_dark_squares_board_is_found(yaw_deg, lost):
     """A VLP-16 loses them at 42 to 66 deg, or measures them up to 8 cm behind the plane."""
     board, T = Board(6, 5, 0.15, 1.1, 0.95), place(3.5, 30, 0, yaw_deg, 10)
     scan = cast([board_plate(T, board), *ROOM], sigma_m=0.006, seed=3)
@@ -164,7 +164,7 @@ def test_board_is_found_by_a_lidar_that_hangs_upside_down():
     assert_is_board(find(turned), turn @ T)
 
 
-def test_hands_over_the_border_cost_ring_ends_and_move_nothing():
+def test_hands_over_border_move_nothing():
     T = place(2.5, 30)
     hands = []
     for x, y in ((0.36, 0.0), (-0.36, 0.1)):
@@ -176,13 +176,13 @@ def test_hands_over_the_border_cost_ring_ends_and_move_nothing():
     assert np.abs(outline_distance(found[0].edge_points, T)).max() < 0.025
 
 
-def test_thing_in_the_board_s_plane_5_cm_beside_it_does_no_harm():
+def test_plate_beside_board_does_no_harm():
     T = place(2.5, 30)
     beside = T @ pose(np.eye(3), np.array([BOARD.width_m / 2 + 0.45, 0, 0]))
     assert_is_board(find(cast([board_plate(T), Plate(beside, 0.8, 0.6), *ROOM], sigma_m=0.01)), T)
 
 
-def test_ring_ends_of_a_noiseless_scan_lie_within_a_step_of_the_border_on_their_side():
+def test_ring_ends_lie_within_a_step():
     T = place(2.5, 30)
     board = find(cast([board_plate(T), *ROOM]))[0]
     step_m = 2.5 * board.azimuth_step_rad
@@ -197,7 +197,7 @@ def test_ring_ends_of_a_noiseless_scan_lie_within_a_step_of_the_border_on_their_
         assert azimuth[ends & (board.edge_side > 0)] > azimuth[ends & (board.edge_side < 0)]
 
 
-def test_normal_edges_and_size_are_unbiased_over_many_boards():
+def test_lidar_board_is_unbiased():
     errors, residuals, sizes, sigmas = [], [], [], []
     rng = np.random.default_rng(5)
     for seed in range(40):
@@ -263,7 +263,7 @@ def test_two_rings_are_refused_with_the_way_to_go():
     ],
     ids=["none", "of another size", "a part of a larger surface"],
 )
-def test_a_room_without_the_board_is_refused_by_what_is_there(shapes, code, figures):
+def test_lidar_board_none_names_the_cause(shapes, code, figures):
     refusal = find(cast([*shapes, *ROOM], sigma_m=0.01))
     assert isinstance(refusal, Refusal) and refusal.code == code
     assert {name: refusal.figures[name] for name in figures} == figures
@@ -282,7 +282,7 @@ def test_bent_board_is_refused_for_its_thickness():
     )
 
 
-def test_plate_with_much_else_in_its_plane_is_no_rival_of_a_clear_board():
+def test_plate_in_larger_plane_is_no_rival():
     T, patch = place(2.5, 30), place(3.0, 150)
     beside = Plate(patch @ pose(np.eye(3), np.array([BOARD.width_m / 2 + 0.35, 0, 0])), 0.6, 0.8)
     assert len(find(cast([board_plate(patch), beside, *ROOM], sigma_m=0.01))) == 1

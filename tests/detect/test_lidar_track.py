@@ -23,7 +23,7 @@ def test_board_in_motion_is_followed_through_every_scan():
         assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.03
 
 
-def test_board_held_still_is_measured_as_well_as_by_the_full_search():
+def test_tracked_board_equals_full_search():
     found_deg, tracked_deg = [], []
     for seed in range(8):
         T = place(2.0 + 0.1 * seed, 40 - 10 * seed, 35, 25, 15)
@@ -36,7 +36,7 @@ def test_board_held_still_is_measured_as_well_as_by_the_full_search():
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.05])
-def test_a_board_is_found_about_the_pose_that_an_image_predicts(off_m):
+def test_predicted_board_is_found(off_m):
     T = place(2.6, 60, 20, 15)
     T_predicted = T.copy()
     T_predicted[:3, 3] += off_m * T[:3, 0]
@@ -44,7 +44,7 @@ def test_a_board_is_found_about_the_pose_that_an_image_predicts(off_m):
     assert np.linalg.norm(found.T_lidar_board[:3, 3] - T[:3, 3]) < 0.02
 
 
-def test_what_is_no_board_is_none_where_one_is_predicted_either():
+def test_predicted_without_board_is_refused():
     T = place(2.6, 60, 20, 15)
     # On a wall, in the air, and where a plate of another size stands.
     for shapes in (room(5.4), room(13.0), [board_plate(T, scale=1.4), *room(13.0)]):

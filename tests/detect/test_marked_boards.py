@@ -49,7 +49,8 @@ def code(pixels: NDArray[np.uint8], board: Board) -> str:
 @pytest.mark.parametrize("T", [NEAR, FAR], ids=["near", "far"])
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
 @pytest.mark.parametrize("is_covered", [False, True], ids=["whole", "covered"])
-def test_corners_lie_as_near_as_a_checkerboards_though_some_are_hidden(board, T, is_covered):
+def test_marked_board_corners_are_accurate(board, T, is_covered):
+    """Covered boards too: as accurate as on a checkerboard."""
     pixels = draw(board, WIDE, T)
     result = found(covered(pixels, board, WIDE, T) if is_covered else pixels, board, WIDE)
     truth, _ = WIDE.project(transform(T, board.corners()))
@@ -66,7 +67,7 @@ def test_corners_lie_as_near_as_a_checkerboards_though_some_are_hidden(board, T,
 
 
 @pytest.mark.parametrize("noise", [2.0, 8.0, 12.0])
-def test_noise_does_not_join_the_tags_of_a_covered_aprilgrid_to_its_squares(noise):
+def test_aprilgrid_noise_does_not_join_tags(noise):
     T = looking(25, 40, 20, (0.1, 0, 2.6))
     pixels = covered(draw(APRILGRID, WIDE, T, noise=noise), APRILGRID, WIDE, T)
     result = find_image_board(picture(pixels), APRILGRID, WIDE, is_thorough=False)
@@ -124,7 +125,7 @@ def test_tags_with_a_border_of_one_module_are_read():
 
 
 @pytest.mark.long
-def test_other_markers_than_the_profiles_are_named_with_what_to_correct():
+def test_marked_board_wrong_marks_are_named():
     pixels, grid = draw(CHARUCO, WIDE, NEAR), draw(APRILGRID, WIDE, NEAR)
     assert code(pixels, replace(CHARUCO, dictionary="6X6_100")) == "image.other_dictionary"
     assert code(grid, CHARUCO) == "image.other_dictionary"
@@ -139,7 +140,7 @@ def test_other_markers_than_the_profiles_are_named_with_what_to_correct():
 
 @pytest.mark.parametrize("T", [NEAR, FAR], ids=["near", "far"])
 @pytest.mark.parametrize("stated", [0.2, 0.25, 0.28, 0.35, 0.4])
-def test_gaps_between_tags_that_the_profile_has_wrong_are_measured(stated, T):
+def test_aprilgrid_wrong_spacing_is_measured(stated, T):
     """Near the truth the corners would fit a pose within limits that is centimetres away."""
     pixels = covered(draw(APRILGRID, WIDE, T), APRILGRID, WIDE, T)
     result = find_image_board(picture(pixels), replace(APRILGRID, gap_share=stated), WIDE)
@@ -148,7 +149,7 @@ def test_gaps_between_tags_that_the_profile_has_wrong_are_measured(stated, T):
 
 
 @pytest.mark.parametrize("part", [0.2, 0.5])
-def test_a_lens_that_the_profile_has_wrong_is_not_taken_for_other_gaps(part):
+def test_aprilgrid_wrong_lens_is_not_spacing(part):
     lens = replace(WIDE, distortion=tuple(part * c for c in WIDE.distortion))
     for board in (APRILGRID, replace(APRILGRID, cols=4, rows=4, square_m=0.2)):
         pixels = draw(board, lens, looking(15, 40, 20, (0.2, 0, 1.3)))
@@ -166,7 +167,7 @@ def test_another_family_of_apriltags_is_named(family):
 
 
 @pytest.mark.long
-def test_a_second_board_of_the_dictionary_is_refused_not_mixed_in():
+def test_charuco_second_board_is_refused():
     other = replace(CHARUCO, first_id=40)
     left, right = looking(10, 0, 0, (-0.45, 0, 1.8)), looking(10, 0, 0, (0.45, 0, 1.8))
     pixels, beside = draw(CHARUCO, WIDE, left), draw(other, WIDE, right)

@@ -61,7 +61,7 @@ def judged(events):
     return np.mean([len(one) for one in found]), residuals
 
 
-def test_nearly_all_tags_are_read_and_their_corners_lie_on_a_plane(recording):
+def test_reconstruct_tags_are_planar(recording):
     n_tags, residuals = judged(whole(recording))
     assert n_tags >= 11.9
     assert np.mean(residuals) <= 1.32

@@ -60,7 +60,7 @@ def test_batches_may_be_cut_anywhere(stream):
         np.testing.assert_array_equal(one.pixels, other.pixels)
 
 
-def test_a_picture_shows_nothing_that_happened_after_its_stamp(stream):
+def test_reconstruct_uses_no_later_events(stream):
     stamp = STAMPS[3]
     early = stream.between(0, stamp + 1)
     whole = next(Reconstructor().reconstruct([stream], [stamp]))
@@ -69,7 +69,8 @@ def test_a_picture_shows_nothing_that_happened_after_its_stamp(stream):
     assert np.abs(whole.pixels.astype(int) - seen.pixels).mean() < 3
 
 
-def test_every_stamp_gets_an_answer_and_warm_up_is_refused_with_its_figures(stream):
+def test_reconstruct_answers_every_timestamp(stream):
+    """Timestamps in the warm-up are refused."""
     stamps = [100 * MS, 300 * MS, *STAMPS]
     answers = list(Reconstructor().reconstruct([stream], stamps))
     assert len(answers) == len(stamps)
@@ -81,7 +82,8 @@ def test_every_stamp_gets_an_answer_and_warm_up_is_refused_with_its_figures(stre
     assert {answer.channel for answer in answers[2:]} == {"events"}
 
 
-def test_events_of_another_resolution_and_ones_that_go_back_in_time_are_an_error(stream):
+def test_reconstruct_bad_events_are_an_error(stream):
+    """Another resolution, or times that go back."""
     other = replace(stream.between(0, 10 * MS), width_px=640, height_px=480)
     for batches in ([stream, other], [stream, stream]):
         with pytest.raises(SourceError):

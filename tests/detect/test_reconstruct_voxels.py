@@ -32,7 +32,7 @@ def random_events(n, seed, width_px=12, height_px=9, duration_ns=50_000_000):
 
 
 @given(st.integers(0, 60), st.integers(0, 10_000), st.integers(2, 7))
-def test_the_grid_equals_the_sum_over_events_of_its_definition(n, seed, n_bins):
+def test_voxel_grid_matches_its_definition(n, seed, n_bins):
     events = random_events(n, seed)
     start, end = -3_000_000, 61_000_000
     expected = np.zeros((n_bins, events.height_px, events.width_px))
@@ -43,7 +43,8 @@ def test_the_grid_equals_the_sum_over_events_of_its_definition(n, seed, n_bins):
     np.testing.assert_allclose(voxel_grid(events, n_bins, start, end), expected, atol=1e-5)
 
 
-def test_normalised_grids_have_mean_0_and_deviation_1_over_what_was_hit():
+def test_voxels_normalised_have_unit_scatter():
+    """Mean 0 and standard deviation 1 over the cells with events."""
     grid = voxel_grid(random_events(200, 1), 5, 0, 50_000_000)
     is_hit = grid != 0
     normalised = normalise_voxels(grid.copy())
@@ -62,7 +63,7 @@ def test_a_hot_pixel_is_told_from_an_edge():
     assert sorted(zip(*np.nonzero(is_hot), strict=True)) == [(10, 40), (10, 41)]
 
 
-def test_most_noise_goes_and_nearly_all_events_of_the_board_stay():
+def test_noise_filter_keeps_board_events():
     board = board_events(Motion(), 0.3, noise_hz=0.0)
     noise_only = random_events(300, 5, 160, 120, 300_000_000)
     assert len(without_background_activity(board)) > 0.98 * len(board)
@@ -87,7 +88,7 @@ def test_events_of_one_polarity_alone_are_a_storm():
 @pytest.mark.parametrize(
     ("name", "is_storm"), [("event_packet_ros1.bag", True), ("davis346_apriltag_libcaer_cmp.mcap", False)]
 )
-def test_a_real_room_with_mains_light_is_told_from_one_without(recordings, name, is_storm):
+def test_flicker_of_mains_light_is_detected(recordings, name, is_storm):
     if not (recordings / "events").is_dir():
         pytest.skip("no recordings of events")
     recording = open_events(recordings / "events" / name)

@@ -38,7 +38,8 @@ def test_board_is_found_however_it_hangs(distance_m: float, yaw_deg: float, roll
     )
 
 
-def test_board_is_found_before_its_holder_and_on_the_floor_beside_a_box() -> None:
+def test_unstructured_board_by_box_is_found() -> None:
+    """Also with a person behind it, and with a box beside it on the floor."""
     T = place(3, 5, 0, 20)
     held = accumulate([board_plate(T), *person(T, 0.25), *room(13)])
     assert_is_at(best(find_unstructured_boards(held, BOARD, POINT_BEAM)), T)
@@ -123,7 +124,7 @@ def test_sparse_board_without_a_located_border_is_refused(n: int) -> None:
         assert len(board.points) >= 10
 
 
-def test_half_a_beam_is_drawn_out_where_it_meets_the_plate_obliquely() -> None:
+def test_half_beam_grows_with_obliquity() -> None:
     """A beam ten times as high as wide, on a plate turned about its upright edges."""
     beam, yaw_rad = Beam(0.005, 0.0005, 0.005), np.radians(40)
     T = place(3, 0, 0, 40)

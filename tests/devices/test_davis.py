@@ -117,7 +117,7 @@ def test_frames_are_stamped_in_the_middle_of_their_exposure(recording):
     assert source.status().n_lost == 1
 
 
-def test_rising_edges_become_counted_pulses_and_others_do_not(recording):
+def test_davis_rising_edges_are_pulses(recording):
     came, _ = play(recording, camera())
     pulses = [sample for sample in came if isinstance(sample, Pulse)]
     assert [pulse.stamp_ns for pulse in pulses] == [
@@ -144,7 +144,8 @@ def test_another_size_is_another_camera(recording):
         list(samples)
 
 
-def test_a_reset_of_the_cameras_clock_is_no_pulse_and_colour_frames_stay_bgr(tmp_path):
+def test_davis_clock_reset_is_no_pulse(tmp_path):
+    """Colour images stay BGR."""
     config = dv.io.MonoCameraWriter.Config("DAVIS346_00000499")
     config.addEventStream(SIZE)
     config.addFrameStream(SIZE)
@@ -198,7 +199,8 @@ def over_network(port):
     return lambda sensor, settings: OpenedCamera(dv.io.NetworkReader("127.0.0.1", port), "a sender")
 
 
-def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone():
+def test_davis_live_lost_sender_is_an_error():
+    """Until then events arrive with a delay of less than 500 ms."""
     with (
         sender(10_000) as (process, port),
         attached(DavisSource("davis", only_events(), over_network(port))) as (source, samples),

@@ -14,7 +14,7 @@ from lce_rig.session import Session
 HERE = Path("somewhere")
 
 
-def test_items_are_written_in_order_while_nothing_waits_for_them():
+def test_disk_writer_keeps_order_unwaited():
     written, may_go = [], threading.Event()
 
     def write(item):
@@ -32,7 +32,7 @@ def test_items_are_written_in_order_while_nothing_waits_for_them():
     assert (disk.n_waiting, disk.n_written) == (0, 3)
 
 
-def test_what_a_slow_disk_cannot_take_is_dropped_counted_and_said(tmp_path):
+def test_disk_writer_slow_disk_drops_counted(tmp_path):
     path = tmp_path / "raw"
     with path.open("wb") as file, DiskWriter(path, file.write, most_waiting_bytes=100_000) as disk:
         for _ in range(40_000):
@@ -54,7 +54,7 @@ def test_a_writer_that_fails_takes_nothing_more():
     assert [finding.code for finding in disk.findings()] == ["device.recording_stopped"]
 
 
-def test_captures_that_cannot_be_written_are_an_error_but_not_over_another(tmp_path):
+def test_capture_writer_keeps_first_error(tmp_path):
     with Session.create(tmp_path / "session", load_rig("rlfs")) as session:
         keeper = CaptureWriter(session)
         with pytest.raises(KeyError), keeper.disk:

@@ -99,7 +99,7 @@ def test_a_program_that_is_not_there_is_named():
         attached(ImagePipeSource("cam", camera("true", pixel_format="H264"))).__enter__()
 
 
-def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path):
+def test_image_pipe_stubborn_child_is_ended(tmp_path):
     then = (
         "import os, signal, subprocess; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
         "inner = subprocess.Popen(['sleep', '60']); "

@@ -50,7 +50,7 @@ def counts(samples):
     return [sample.count for sample in samples if isinstance(sample, Pulse)]
 
 
-def test_samples_come_in_order_and_then_the_reason_of_the_end():
+def test_reading_error_follows_the_samples():
     with attached(Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone"))) as (source, samples):
         came = []
         with pytest.raises(SourceError, match="gone"):
@@ -66,7 +66,7 @@ def test_nothing_for_too_long_is_an_error_with_a_hint():
     assert caught.value.hint == HINT
 
 
-def test_what_nobody_takes_is_dropped_oldest_first_and_counted():
+def test_reading_oldest_samples_are_dropped():
     came = []
     with attached(Script(n_slots=4)) as (source, samples):
         source.entries += [[pulse(k) for k in range(10)], SourceError("gone")]
@@ -79,7 +79,7 @@ def test_what_nobody_takes_is_dropped_oldest_first_and_counted():
     assert [sample.count for sample in came if isinstance(sample, Pulse)] == [6, 7, 8, 9]
 
 
-def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one():
+def test_reading_driver_bug_is_source_error():
     with (
         attached(Script([pulse(0)], ZeroDivisionError("oops"))) as (_, samples),
         pytest.raises(SourceError) as caught,
@@ -88,7 +88,8 @@ def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one():
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
-def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_others_is_lost():
+def test_reading_failed_sensor_is_reopened():
+    """Samples of the other sensors are not lost."""
     lossy = Script([pulse(0)], SourceError("gone"), [pulse(1)])
     steady = Script(*[[pulse(k)] for k in range(5)], name="t")
     with AttachedSensors([lossy, steady], reopen_every_s=0.05) as sensors:
@@ -102,7 +103,7 @@ def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_ot
         assert {name: status.n_dropped for name, status in sensors.statuses().items()} == {"s": 0, "t": 0}
 
 
-def test_what_comes_while_others_are_being_opened_is_no_loss():
+def test_attach_early_overflow_is_no_loss():
     class Slow(Script):
         def open(self):
             while early.entries:
@@ -114,7 +115,7 @@ def test_what_comes_while_others_are_being_opened_is_no_loss():
         assert sensors.statuses()["s"].n_dropped == 0
 
 
-def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again():
+def test_reading_close_ends_a_reopening():
     class Absent(Script):
         """Gone for good: opening it waits until it is told to give up."""
 
@@ -134,7 +135,7 @@ def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again():
     assert not source.is_open
 
 
-def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes():
+def test_rate_meter_falls_without_samples():
     clock_s = [100.0]
     meter = RateMeter(lambda: clock_s[0])
     assert meter.rate_hz == 0
@@ -178,7 +179,8 @@ def test_the_profile_may_choose_the_driver(changes, source):
 
 
 @pytest.mark.parametrize("wanted", ["v4l", "vlp16", "sync_board"])
-def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_opening(wanted):
+def test_open_live_unknown_driver_is_refused(wanted):
+    """The other sensors can still be opened."""
     rig = changed(load_rig("rlfs"), cameras__cam__driver__type=wanted)
     with pytest.raises(SourceError) as caught:
         open_live(rig)

@@ -127,7 +127,7 @@ def with_topic(rig, topic):
 
 
 @pytest.mark.usefixtures("graph")
-def test_topics_that_do_not_serve_are_refused_with_those_that_would(rig, monkeypatch):
+def test_ros2_unusable_topic_lists_others(rig, monkeypatch):
     monkeypatch.setattr("lce_rig.devices.ros2._DISCOVERY_S", 0.2)
     absent, wrong, unnamed = (refusal(with_topic(rig, topic)) for topic in ("/velodyne", IMAGES, None))
     assert "/velodyne" in absent.what and POINTS in absent.hint

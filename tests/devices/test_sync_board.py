@@ -73,7 +73,8 @@ def test_its_lines_are_set_and_started_as_the_profile_says():
             assert "LCERT,0,4.000000,2500,50" in fake.commands
 
 
-def test_a_board_without_a_receiver_is_told_when_a_second_begins():
+def test_sync_board_lone_is_given_the_second():
+    """No receiver is attached: the computer sends the time."""
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))):
         wait_until(lambda: any(command.startswith("LCEUT") for command in fake.commands))
         command = next(command for command in fake.commands if command.startswith("LCEUT"))

@@ -44,7 +44,7 @@ def problems(state, now_s=10.0, heard_s=10.0):
     return state.problems(round(now_s * S))
 
 
-def test_a_computer_that_was_busy_and_reads_all_at_once_is_no_new_beginning():
+def test_board_state_late_read_is_no_restart():
     state = BoardState({0: "cam"})
     pulses(state, range(20))
     for number in range(20, 120):
@@ -71,7 +71,7 @@ def ask(state, steady_s, set_by_s=0.0, there_s=80e-6, back_s=80e-6, board_start_
     )
 
 
-def test_answers_to_other_questions_and_of_last_week_are_left_out():
+def test_board_state_old_answers_are_skipped():
     state = BoardState({})
     state.asked(3, DAY_NS)
     state.take(TimeReply(2, 100_000_000, 100_000_010), arrival(0.001))
@@ -80,7 +80,7 @@ def test_answers_to_other_questions_and_of_last_week_are_left_out():
     assert state.has_answered and state.host_tracker.model is None
 
 
-def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
+def test_board_state_clock_step_is_followed():
     state = BoardState({})
     for k in range(200):
         ask(state, 0.1 * k, set_by_s=3.0 * (k >= 100), cookie=k)
@@ -171,11 +171,12 @@ def test_every_sentence_is_understood(body, message):
         "LCEST,1,2",
     ],
 )
-def test_sentences_with_a_right_sum_and_wrong_fields_are_malformed(body):
+def test_sync_wrong_fields_are_malformed(body):
     assert read(write_sentence(body)) == ([], 1)
 
 
-def test_wrong_sums_are_counted_and_unknown_sentences_told_apart():
+def test_sync_wrong_sums_are_counted():
+    """Unknown sentences are not."""
     data = b"$LCETG,0,1,2,R*00\n" + write_sentence("LCEXX,1") + b"hello\n" + write_sentence("GPGGA,1,2")
     assert read(data) == ([], 1)
 
@@ -196,7 +197,7 @@ def test_lines_cut_anywhere_are_joined_again(bodies, random):
     st.sampled_from(sorted(BODIES)),
     st.lists(st.tuples(st.integers(0, 60), st.integers(0, 4), st.binary(max_size=8)), min_size=1, max_size=3),
 )
-def test_a_damaged_line_makes_no_message_that_its_sum_denies(body, damages):
+def test_sync_damaged_lines_give_no_message(body, damages):
     data = write_sentence(body)
     for at, n_cut, put in damages:
         data = data[:at] + put + data[at + n_cut :]
@@ -209,7 +210,7 @@ def test_a_damaged_line_makes_no_message_that_its_sum_denies(body, damages):
         assert any(digits <= set(said.decode("latin-1").split(",")) for said in sound)
 
 
-def test_a_line_without_an_end_is_cut_off_and_the_next_one_read():
+def test_sync_endless_line_is_cut_off():
     reader = LineReader()
     for _ in range(1000):
         assert reader.feed(b"9" * 1000) == []

@@ -97,7 +97,7 @@ def of_kind(messages, kind):
     return [message for message in messages if isinstance(message, kind)]
 
 
-def test_the_sketch_is_sound_for_the_arduino_interface_it_uses(compiler):
+def test_sketch_compiles_with_arduino_stub(compiler):
     stub = FIRMWARE / "host" / "Arduino.h"
     command = [
         compiler,
@@ -133,7 +133,7 @@ def test_it_introduces_itself_and_makes_a_pulse_per_second(virtual):
 
 
 @pytest.mark.parametrize(("rate", "phase_us", "n"), [("20.0", 0, 20), ("30.0", 5000, 30), ("1.0", 250000, 1)])
-def test_pulses_in_whole_hertz_keep_their_place_in_every_second(virtual, rate, phase_us, n):
+def test_pulses_keep_phase_in_every_second(virtual, rate, phase_us, n):
     messages = virtual(5.5, (1000, f"LCERT,2,{rate},{phase_us},200"), (2000, "LCEGO"))
     seconds = [edge.t_us for edge in of_kind(messages, PpsEdge)]
     pulses = rising(messages, 2)
@@ -145,7 +145,7 @@ def test_pulses_in_whole_hertz_keep_their_place_in_every_second(virtual, rate, p
         assert max(abs(a - b) for a, b in zip(times, wanted, strict=True)) <= 2 * TICK_US
 
 
-def test_pulses_of_any_rate_keep_it_without_adding_up_errors(virtual):
+def test_pulses_of_any_rate_add_no_errors(virtual):
     messages = virtual(60, (1000, "LCERT,0,33.333333,0,100"), (2000, "LCEGO"))
     times = [pulse.t_us for pulse in rising(messages, 0)]
     wanted = [times[0] + k * 1e6 / 33.333333 for k in range(len(times))]
@@ -153,7 +153,7 @@ def test_pulses_of_any_rate_keep_it_without_adding_up_errors(virtual):
     assert max(abs(a - b) for a, b in zip(times, wanted, strict=True)) <= 2 * TICK_US
 
 
-def test_told_when_a_second_begins_it_moves_its_pulse_there_and_names_it(virtual):
+def test_board_given_a_second_moves_pulse(virtual):
     messages = virtual(5.9, (100_000, f"LCEUT,2345678,{UTC_S}"))
     edges = of_kind(messages, PpsEdge)
     assert [edge.utc_s for edge in edges] == [UTC_S - 1 + k for k in range(5)]
@@ -161,7 +161,7 @@ def test_told_when_a_second_begins_it_moves_its_pulse_there_and_names_it(virtual
     assert of_kind(messages, BoardStatus)[-1].flags == 6
 
 
-def test_the_sentence_follows_its_pulse_within_what_a_vlp_16_allows(virtual):
+def test_sentence_follows_pulse_for_a_vlp_16(virtual):
     messages = virtual(4.9, (100_000, f"LCEUT,2000000,{UTC_S}"))
     pps = [k for k, message in enumerate(messages) if isinstance(message, PpsEdge)]
     for k in pps:
@@ -175,7 +175,7 @@ def test_the_sentence_follows_its_pulse_within_what_a_vlp_16_allows(virtual):
     assert high_us + 50_000 <= after_us and after_us + 80 * 10 / 9600 * 1e6 <= 600_000
 
 
-def test_a_drifting_clock_is_followed_by_seconds_a_little_longer_or_shorter(virtual):
+def test_drifting_clock_is_followed_smoothly(virtual):
     # The computer's seconds are 30 us longer than the board's: every 10 s it is told anew.
     told = [
         (100_000 + k * 10_000_000, f"LCEUT,{2_000_000 + k * 10_000_300},{UTC_S + 10 * k}") for k in range(6)
@@ -231,7 +231,7 @@ def running(host_board):
     os.close(slave)
 
 
-def test_our_live_source_and_the_firmware_understand_each_other(running):
+def test_firmware_works_with_live_source(running):
     given = {"device": running.path, "triggers": {"cam": {"channel": 1, "rate_hz": 50.0, "phase_us": 3000}}}
     with attached(SyncBoard(SyncSettings.model_validate(given))) as (board, samples):
         pulses, told, end_s = [], [], time.monotonic() + 30
@@ -252,7 +252,8 @@ def test_our_live_source_and_the_firmware_understand_each_other(running):
     assert not codes & {"stream.damaged_lines", "device.board_error", "device.board_restarted"}
 
 
-def test_noise_on_its_input_is_survived_and_a_computer_that_does_not_read_costs_lines_only(running):
+def test_firmware_survives_input_noise(running):
+    """A computer that does not read costs lines only."""
     descriptor = os.open(running.path, os.O_RDWR | os.O_NOCTTY)
     try:
         rng = random.Random(1)

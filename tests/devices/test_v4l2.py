@@ -33,7 +33,7 @@ def refusal(device):
     return caught.value
 
 
-def test_a_camera_that_is_not_there_is_named_with_what_to_check():
+def test_v4l2_absent_camera_is_named():
     error = refusal("/dev/video-of-nobody")
     assert has_note([error.what], "'cam'", "/dev/video-of-nobody", "not there")
     assert "driver.device" in error.hint or "camera's cable" in error.hint
@@ -104,7 +104,7 @@ OFFSETS = {
 }
 
 
-def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path):
+def test_v4l2_structures_match_the_kernel(tmp_path):
     compiler = shutil.which("cc")
     if compiler is None or not HEADER.exists():
         pytest.skip("no C compiler, or no kernel headers")
@@ -121,7 +121,7 @@ def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path):
     assert dict(zip(asked, map(int, said), strict=True)) == dict(zip(asked, ours, strict=True))
 
 
-def test_the_serial_number_is_that_of_the_usb_device_behind_a_camera(tmp_path):
+def test_v4l2_serial_is_that_of_usb_device(tmp_path):
     # As the kernel lists a webcam and a camera of a CSI port.
     interface = tmp_path / "devices" / "usb1" / "1-4" / "1-4:1.0"
     interface.mkdir(parents=True)
@@ -196,6 +196,6 @@ def test_images_come_whole_counted_and_stamped(kernel):
         assert np.abs(np.array(pixels) - grey[None, :, None]).max() <= 2
 
 
-def test_a_camera_that_delivers_planes_only_is_refused_with_the_way_to_read_it(kernel):
+def test_v4l2_planes_only_is_refused(kernel):
     ran = read(kernel, "NM12", is_planar=True)
     assert ran.returncode != 0 and "SourceError" in ran.stderr and "gst-launch" in ran.stderr

@@ -114,7 +114,7 @@ def stamps(scans):
 # What comes
 
 
-def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(lidar):
+def test_vlp16_full_rate_loses_no_packet(lidar):
     room = Room(13)
     with streaming(lidar, room) as (source, samples):
         scans = take(samples, 12)
@@ -131,7 +131,7 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
 
 
 @pytest.mark.parametrize("address", [HERE, None])
-def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(lidar, address):
+def test_vlp16_other_addresses_are_ignored(lidar, address):
     room = Room(3)
     source = Vlp16Source("lidar", changed(lidar, driver__address=address), silence_s=PATIENT_S)
     stranger = Sender(lidar, source, ELSEWHERE)
@@ -145,7 +145,7 @@ def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(lidar
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:2]]
 
 
-def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar):
+def test_vlp16_closed_source_can_reopen(lidar):
     source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S)
     for _ in range(2):
         with Sender(lidar, source).sending(Room(3)), attached(source) as (_, samples):
@@ -165,14 +165,14 @@ def explain(lidar, packets=None, **options):
     return caught.value
 
 
-def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar):
+def test_vlp16_absent_sensor_lists_checks(lidar):
     error = explain(lidar)
     assert HERE in error.what and str(lidar.driver.port) in error.what
     for word in ("power", "cable", "192.168.1.x", "driver.address", "firewall"):
         assert word in error.hint
 
 
-def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar):
+def test_vlp16_silent_sensor_is_an_error(lidar):
     with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0) as (_, samples):
         assert len(take(samples, 2)) == 2
         with pytest.raises(SourceError, match=str(lidar.driver.port)):
@@ -208,7 +208,7 @@ def test_a_port_that_another_program_holds_is_named(lidar):
 # What is said
 
 
-def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken():
+def test_udp_arrival_is_stamped_by_kernel():
     port = UdpPort(free_ports()[0], "test")
     late_s = 0.02
 

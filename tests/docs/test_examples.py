@@ -54,7 +54,7 @@ def test_every_example_is_run_here():
 
 
 @pytest.mark.long
-def test_a_folder_of_images_and_clouds_becomes_a_result_and_overlays(workplace):
+def test_example_folder_gives_a_result(workplace):
     for capture in lce.Session.open("monday").captures:
         for kind, name in (("img", "davis.frames.png"), ("pcd", "lidar.pcd")):
             (workplace / "folder" / kind).mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def test_two_sessions_are_compared_by_their_figures(workplace, capsys):
 
 
 @pytest.mark.long
-def test_scans_of_a_reader_of_ones_own_give_the_same_extrinsic(workplace, capsys):
+def test_example_own_reader_gives_extrinsics(workplace, capsys):
     session = lce.Session.open("monday")
     (workplace / "folder").mkdir()
     for capture in session.captures:

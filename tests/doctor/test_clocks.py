@@ -44,7 +44,7 @@ def test_a_davis_is_fitted_to_the_edges_it_saw():
     assert line.findings[0].figure("rms_us") < 2
 
 
-def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire():
+def test_davis_without_edges_is_an_error():
     line = look(check_edges, examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
     assert line is not None and line.severity == "error"
     assert codes(line) == ["edges.not_fitted", "edges.none_seen"]
@@ -67,7 +67,7 @@ def test_a_clock_that_is_not_tied_is_named_with_the_way_out():
     assert reason.code == "sync.no_board"
 
 
-def test_still_boards_are_no_fault_where_the_profile_promises_nothing():
+def test_no_sync_in_profile_is_a_note():
     rig = make_rig(
         sync=None,
         lidars={"lidar": {}},
@@ -82,7 +82,7 @@ def test_absent_sensors_are_left_out_of_the_verdict():
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
-def test_doubts_of_a_driver_about_its_clock_stand_in_its_line():
+def test_driver_clock_problems_stand_in_line():
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
     arrival = Finding("clock.arrival", "note")
     line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")

@@ -23,7 +23,7 @@ def test_what_does_not_open_is_red_with_what_to_check():
     assert look(check_stream, examination(seen), "cam") is None
 
 
-def test_complaints_of_a_driver_stand_in_the_line_they_belong_to():
+def test_driver_problems_stand_in_their_line():
     status = {
         "device": "DAVIS346",
         "problems": (
@@ -80,14 +80,15 @@ def test_a_triggered_camera_without_pictures_is_red():
     assert line is not None and line.severity == "error" and codes(line)[0] == "stream.none"
 
 
-def test_the_wanted_rate_is_the_triggers_the_drivers_or_the_davis_own():
+def test_wanted_rate_of_trigger_or_driver():
     assert wanted_rate_hz(make_rig(), "cam", "command") == 20
     assert wanted_rate_hz(make_rig(), "lidar", "vlp16") == 10
     assert wanted_rate_hz(make_rig(sync=None), "cam", "command") is None
     assert wanted_rate_hz(load_rig("rles"), "davis", "davis") == 25
 
 
-def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path):
+def test_disk_of_absent_folder_is_measured(tmp_path):
+    """Nothing is left behind."""
     line = look(check_disk, Examination(make_rig(), tmp_path / "not" / "yet"))
     disk = line.findings[0]
     assert disk.figure("write_mbps") > 0 and disk.figure("free_mb") > 0

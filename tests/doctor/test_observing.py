@@ -48,7 +48,7 @@ class TimedBoard(SyncBoard):
 ABSENT = Unusable("gone", SourceError("it is not there", "Plug it in."))
 
 
-def test_what_fails_is_said_and_the_others_are_watched_all_the_same():
+def test_observe_failure_keeps_other_sensors():
     with FakeBoard(period_s=0.05) as fake:
         settings = SyncSettings.model_validate(
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}

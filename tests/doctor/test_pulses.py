@@ -17,7 +17,7 @@ def with_trigger(**trigger):
     return with_sync(triggers={"cam": {"channel": 0, "rate_hz": 20.0, **trigger}})
 
 
-def test_as_many_frames_as_pulses_are_green_with_their_delay():
+def test_equal_images_and_pulses_are_a_note():
     line = look(check_frames_of_pulses, examination(camera(), sync_board()), "cam")
     assert line is not None and line.severity == "note"
     counts, delay = line.findings
@@ -27,7 +27,7 @@ def test_as_many_frames_as_pulses_are_green_with_their_delay():
     assert delay.figure("delay_scatter_ms") < 0.01
 
 
-def test_frames_that_come_too_late_for_their_pulses_are_not_matched():
+def test_late_images_match_no_pulse():
     line = look(
         check_frames_of_pulses,
         examination(camera(delay_s=0.045), sync_board(), rig=with_trigger(max_delay_s=0.03)),
@@ -36,7 +36,7 @@ def test_frames_that_come_too_late_for_their_pulses_are_not_matched():
     assert line is not None and line.severity == "error" and "pulses.images_without" in codes(line)
 
 
-def test_where_two_pulses_could_have_made_a_frame_they_are_counted():
+def test_ambiguous_pulses_are_counted():
     exam = examination(camera(), sync_board(), rig=with_trigger(max_delay_s=0.1))
     line = look(check_frames_of_pulses, exam, "cam")
     assert line is not None and (line.severity, codes(line)) == ("note", ["pulses.frames"])

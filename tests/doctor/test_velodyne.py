@@ -26,7 +26,7 @@ def test_a_locked_sensor_is_green_with_the_time_it_was_told():
         ({"clock": "host", "sync": "none"}, "note"),
     ],
 )
-def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(timestamps, severity):
+def test_velodyne_pps_follows_the_profile(timestamps, severity):
     seen = lidar(clock=UNLOCKED, problems=(UNLOCKED,))
     line = look(check_pps, examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity

@@ -56,7 +56,7 @@ def test_every_format_survives_any_pose(rles, make, tmp_path, T_lidar_body):
     np.testing.assert_allclose(read, T_cam_lidar, atol=1e-12)
 
 
-def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(rles, make, tmp_path):
+def test_extrinsics_notations_agree(rles, make, tmp_path):
     calibration = make()
     (path,) = export([calibration], rles, tmp_path, formats=["extrinsics"])
     (pair,) = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
@@ -82,7 +82,7 @@ def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(rles, mak
     np.testing.assert_array_equal(pair["covariance"]["matrix"], calibration.cov)
 
 
-def test_static_transforms_for_both_ros_versions_say_the_same(rles, make, tmp_path):
+def test_static_tf_ros1_equals_ros2(rles, make, tmp_path):
     (path,) = export([make()], rles, tmp_path, formats=["static_tf"])
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     # What ROS 2 is told is read back elsewhere; ROS 1 takes the same values in the same order, without names.
@@ -101,7 +101,7 @@ def random_pose(seed):
 
 
 @pytest.mark.parametrize("base", [None, "velodyne_back", "left_link"])
-def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(three_sensor_rig, make, tmp_path, base):
+def test_export_several_sensors_share_a_tree(three_sensor_rig, make, tmp_path, base):
     rig = three_sensor_rig.model_copy(update={"base_frame": base})
     pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("fish", "back")]
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
@@ -116,7 +116,7 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(three_sensor
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
-def test_sensors_that_no_calibration_connects_get_a_urdf_each(three_sensor_rig, make, tmp_path):
+def test_export_unconnected_gives_two_urdfs(three_sensor_rig, make, tmp_path):
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
     paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
@@ -139,7 +139,8 @@ def test_frames_that_make_no_tree_are_refused(links, joints):
         RobotTree.of_joints("a.urdf", [Joint(parent, child, np.eye(4)) for parent, child in joints], links)
 
 
-def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(rles, make, tmp_path):
+def test_export_failed_result_is_refused(rles, make, tmp_path):
+    """Exports of an earlier run are removed, other files stay."""
     export([make()], rles, tmp_path)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     failed = make(verdict="fail", findings=(reason("translation known to 80 mm only"),))
@@ -149,7 +150,7 @@ def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_le
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_forced_export_of_a_failed_result_says_so_in_every_file(rles, make, tmp_path):
+def test_export_forced_failure_is_marked(rles, make, tmp_path):
     failed = make(verdict="fail", findings=(reason("sigma -- 80 mm\nand more"),))
     paths = export([failed], rles, tmp_path, formats=EXPORTS, is_forced=True)
     for path in paths:
@@ -199,7 +200,7 @@ def test_a_lens_of_opencv_is_read(version, extra, model, tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(EXPORTS))
-def test_a_pose_that_is_not_finite_is_refused_before_a_file_is_written(name, rles, make, tmp_path):
+def test_export_infinite_pose_is_refused(name, rles, make, tmp_path):
     with pytest.raises(ResultRefusedError):
         export([make(np.full((4, 4), np.nan))], rles, tmp_path, formats=[name])
     assert not list(tmp_path.iterdir())
@@ -229,7 +230,7 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make
 
 
 @pytest.mark.parametrize(("focal_px", "limit_px"), [(900, 0.2), (450, 0.1), (300, 0.1)])
-def test_a_wide_lens_with_fewer_coefficients_draws_the_whole_image(focal_px, limit_px):
+def test_fit_lens_fewer_terms_cover_image(focal_px, limit_px):
     """At 900 px the five coefficients that fit best fold back before the image's corner."""
     coefficients = (-0.4, 0.2, 0.001, 0.0, -0.05, 0.1, -0.02, 0.01)
     true = Intrinsics(focal_px, focal_px, 640, 360, 1280, 720, "radtan", coefficients)
@@ -241,7 +242,7 @@ def test_a_wide_lens_with_fewer_coefficients_draws_the_whole_image(focal_px, lim
 
 
 @pytest.mark.parametrize("n_coefficients", [4, 5])
-def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(three_sensor_rig, n_coefficients):
+def test_fit_lens_reported_error_is_true(three_sensor_rig, n_coefficients):
     true = three_sensor_rig.cameras["left"].to_intrinsics()
     lens, rms_px, max_px = fit_lens(true, f"radtan{n_coefficients}")
     assert len(lens.distortion) == n_coefficients

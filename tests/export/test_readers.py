@@ -40,7 +40,7 @@ def test_every_format_has_a_reader_and_a_wrong_pose_is_seen(case):
     assert off_px(moved, key[0], READERS[key]) > 1e-6
 
 
-def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case, tmp_path):
+def test_remove_exports_spares_other_files(case, tmp_path):
     import shutil
 
     folder = tmp_path / "out"

@@ -75,7 +75,7 @@ ROBOT = [
 
 
 @pytest.mark.parametrize("name", ["robot.bag", "robot_db3", "robot_mcap"])
-def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(rles, make, tmp_path, name):
+def test_robot_bag_of_any_kind_fits_outputs(rles, make, tmp_path, name):
     # The camera comes in a second message, as from a second publisher, and an old one is published anew.
     path = write_bag(tmp_path / name, [[("base_link", "mast", placed(7.0)), *ROBOT[1:2]], ROBOT])
     robot = read_robot(path)
@@ -101,14 +101,15 @@ def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(rles, make, tmp_
     assert published == [["--frame-id", "mast", "--child-frame-id", "velodyne"]]
 
 
-def test_a_camera_without_optical_frame_gets_one_as_rep_103_has_it(rles, make, tmp_path):
+def test_robot_bag_lacking_optical_gets_one(rles, make, tmp_path):
+    """Its axes are those of REP 103."""
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [ROBOT[:3]]))
     tree, changes, _ = fit_tree(robot, [make()], rles)
     assert [change.joint.child for change in changes] == ["velodyne", "davis_optical_frame"]
     np.testing.assert_allclose(tree.find_pose("davis_link", "davis_optical_frame"), OPTICAL, atol=1e-12)
 
 
-def test_a_moving_joint_above_the_sensors_is_where_the_tree_begins(rles, make, tmp_path):
+def test_robot_bag_tree_starts_below_joint(rles, make, tmp_path):
     """The head's pose on the base is on /tf; static are only the transforms in the head."""
     head = [("head", child, T) for _, child, T in (ROBOT[0], ROBOT[2])]
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [[*head, *ROBOT[1:2], *ROBOT[3:]]]))
@@ -152,7 +153,7 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path)
         build_trees([make()], elsewhere, whole)
 
 
-def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles, make, tmp_path):
+def test_autoware_kit_keeps_robot_frames(rles, make, tmp_path):
     import yaml
 
     housing = placed(0.0) * [[1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]]  # 0.2 m above its base

@@ -46,9 +46,8 @@ def found(path, rig):
 
 @pytest.mark.parametrize("has_camera", [False, True])
 @pytest.mark.parametrize("has_optical", [False, True])
-def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
-    rles, make, tmp_path, has_camera, has_optical
-):
+def test_urdf_camera_is_moved_or_added(rles, make, tmp_path, has_camera, has_optical):
+    """Moved below its own parent, added below the LiDAR."""
     path, calibration = tmp_path / "cart.urdf", make()
     text = HEAD + BASE + MAST + (CAMERA.format(kind="fixed") if has_camera else "")
     text += (OPTICAL if has_camera and has_optical else "") + "</robot>\n<!-- end -->\n"
@@ -69,7 +68,7 @@ def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
     assert write_into_urdf(path, [calibration], rles, NOW) == (None, [])
 
 
-def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(rles, make, tmp_path):
+def test_urdf_lidar_below_camera_is_moved(rles, make, tmp_path):
     path, calibration = tmp_path / "cart.urdf", make()
     mast = MAST.replace('"base_link"', '"davis_link"')
     path.write_text(HEAD + BASE + CAMERA.format(kind="fixed") + mast + OPTICAL + "</robot>\n")
@@ -109,7 +108,7 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(rles, make, tmp
         "empty",
     ],
 )
-def test_a_urdf_that_does_not_fit_is_refused_and_stays_as_it_was(rles, make, tmp_path, text):
+def test_urdf_misfit_is_refused_unchanged(rles, make, tmp_path, text):
     path = tmp_path / "cart.urdf"
     before = text.encode() if isinstance(text, str) else text
     path.write_bytes(before)
@@ -131,7 +130,7 @@ def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles, make, tmp_path
     assert backup is not None and backup.parent == target.parent
 
 
-def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(three_sensor_rig, make, tmp_path):
+def test_urdf_sensor_nearest_root_stays(three_sensor_rig, make, tmp_path):
     rng = np.random.default_rng(0)
     poses = [pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(3)]
     pairs = [("davis", "front"), ("davis", "back"), ("left", "back")]
@@ -146,7 +145,7 @@ def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(three_sen
         np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
 
 
-def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles, make, tmp_path):
+def test_mount_is_the_root_of_outputs(rles, make, tmp_path):
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
     export([make()], rig, tmp_path)

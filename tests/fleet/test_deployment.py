@@ -28,7 +28,7 @@ def with_settings(target, **changes):
     return TargetSettings.model_validate(target.model_dump() | changes)
 
 
-def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(result, rig, target, robot):
+def test_deploy_and_rollback_are_exact(result, rig, target, robot):
     folder = result("a")
     first = deploy(folder, rig, target)
     assert first.is_new and first.replaces == "" and first.output is None
@@ -70,7 +70,7 @@ def test_the_same_files_are_deployed_once(result, rig, local, robot):
         rollback(local)
 
 
-def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(result, rig, target, robot):
+def test_deploy_dry_run_changes_nothing(result, rig, target, robot):
     planned = plan(result("a"), rig, target)
     assert planned.state.current is None and not robot.exists()
     (change,) = planned.sensors
@@ -98,9 +98,7 @@ def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(result, rig, ta
         ({"origin": replace(ORIGIN, date="2026-11-19T10:22:03Z")}, "deploy.older"),
     ],
 )
-def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
-    result, rig, local, robot, changes, code
-):
+def test_deploy_unfit_result_needs_a_reason(result, rig, local, robot, changes, code):
     deploy(result("a"), rig, local)
     before = content_of(robot / "current")
     folder = result("b", **changes)
@@ -114,7 +112,7 @@ def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
 
-def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(result, rig, local):
+def test_deploy_names_robot_or_takes_unknown(result, rig, local):
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
     unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))
@@ -143,7 +141,7 @@ def test_formats_are_chosen(result, rig, local, robot):
     assert set(content_of(robot / "current")) == {"result.json", "rles.urdf"}
 
 
-def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(result, rig, target, robot):
+def test_deploy_failed_command_runs_again(result, rig, target, robot):
     folder = result("a")
     failing = with_settings(target, run="ls rles.urdf; echo not today >&2; test -e ../../ready || exit 3")
     with pytest.raises(CommandError, match="3") as caught:
@@ -181,7 +179,8 @@ def test_of_two_deployments_at_once_one_is_refused(result, rig, local, robot):
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
 
 
-def test_files_that_the_disk_does_not_give_back_are_not_made_current(result, rig, local, robot):
+def test_deploy_damaged_files_are_refused(result, rig, local, robot):
+    """The earlier release stays current."""
     first = deploy(result("a"), rig, local).release
 
     def damage(draft):
@@ -223,7 +222,7 @@ def tree(folder):
         "mkdir -p robot && mkfifo robot/deployments.log",
     ],
 )
-def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(result, rig, local, tmp_path, way):
+def test_deploy_foreign_folder_is_refused(result, rig, local, tmp_path, way):
     folder = result("a")
     subprocess.run(["sh", "-c", way], cwd=tmp_path, check=True)
     before = tree(tmp_path)
@@ -233,7 +232,8 @@ def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(result, rig, lo
     assert tree(tmp_path) == before
 
 
-def test_only_own_releases_are_removed_and_only_after_the_switch(result, rig, local, robot):
+def test_deploy_removes_own_releases_only(result, rig, local, robot):
+    """Only after the switch."""
     few = with_settings(local, keep=2)
     first = deploy(result("a"), rig, few).release
     others = ["golden", "20260101T000000Z-00000000", "20260101T000000Z-0000000", "notes.txt"]
@@ -252,7 +252,7 @@ def test_only_own_releases_are_removed_and_only_after_the_switch(result, rig, lo
     assert sorted(path.name for path in (robot / "releases").iterdir()) == sorted([*others, *names[1:]])
 
 
-def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(result, rig, local, robot):
+def test_deploy_rollback_keeps_previous(result, rig, local, robot):
     few = with_settings(local, keep=2)
     first, _ = (deploy(result(name, x_m), rig, few).release for name, x_m in (("a", 0.1), ("b", 0.12)))
     rollback(few)
@@ -261,7 +261,7 @@ def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(res
     assert rollback(few).release == first
 
 
-def test_releases_are_named_in_order_where_the_clock_was_set_back(result, rig, local, robot):
+def test_deploy_clock_set_back_keeps_order(result, rig, local, robot):
     early = deploy(result("a"), rig, local).release
     late = early.model_copy(update={"name": f"20990101T000000Z-{early.name[-8:]}"})
     (robot / "releases" / early.name).rename(robot / "releases" / late.name)
@@ -297,7 +297,7 @@ def test_a_robot_without_flock_is_deployed_to(result, rig, local, robot, tmp_pat
     assert not (robot / ".lock").exists() and not standing(local).changed
 
 
-def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(result, rig, target, robot):
+def test_deploy_link_to_device_is_replaced(result, rig, target, robot):
     deploy(result("a"), rig, target)
     (robot / "current" / "extrinsics.yaml").unlink()
     (robot / "current" / "extrinsics.yaml").symlink_to("/dev/zero")
@@ -343,7 +343,7 @@ class Failing(Place):
 
 
 @pytest.mark.long
-def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(result, rig, local, robot, tmp_path):
+def test_deploy_killed_shell_leaves_one_set(result, rig, local, robot, tmp_path):
     settings = with_settings(local, keep=2, formats=["urdf"])
     folders = [result("a"), result("b", 0.15)]
     sound = Failing(settings, tmp_path / "sound", 0)

@@ -13,7 +13,7 @@ def lay_out(root, *sessions):
         (root / name / "session.json").write_text("{}")
 
 
-def test_every_session_is_found_once_and_named_after_the_first_folder(tmp_path):
+def test_find_jobs_names_each_session_once(tmp_path):
     lay_out(tmp_path, "r1/2026/a", "r2/b", "c", "r1/2026/a/results/inner", ".hidden/d")
     jobs = find_jobs(Storage.at(tmp_path))
     found = {job.source.removeprefix(f"{tmp_path}/"): job.fallback_robot for job in jobs}
@@ -79,7 +79,7 @@ def test_a_misspelt_key_of_a_manifest_is_told_the_nearest(tmp_path):
         find_jobs(Storage.at(tmp_path))
 
 
-def test_entries_without_a_robot_are_named_by_their_first_folder(tmp_path):
+def test_find_jobs_robot_is_first_folder(tmp_path):
     lay_out(tmp_path, "r1/a", "b")
     (tmp_path / "fleet.yaml").write_text("sessions: [{path: '**/*'}, {path: '*'}]")
     jobs = {job.source.removeprefix(f"{tmp_path}/"): job for job in find_jobs(Storage.at(tmp_path))}
@@ -87,7 +87,7 @@ def test_entries_without_a_robot_are_named_by_their_first_folder(tmp_path):
 
 
 @pytest.mark.parametrize("rig", ["nosuch.yaml", "/nosuch/r.yaml", "rlfz"])
-def test_a_profile_that_does_not_exist_is_refused_before_anything_runs(tmp_path, rig):
+def test_find_jobs_absent_profile_is_refused(tmp_path, rig):
     lay_out(tmp_path, "a")
     (tmp_path / "fleet.yaml").write_text(f"sessions: [{{path: '*', rig: {rig}}}]")
     with pytest.raises(ProfileError, match=rig.rpartition("/")[2]):

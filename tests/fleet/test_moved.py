@@ -56,17 +56,19 @@ def test_a_move_is_named_with_its_dates_and_sizes(result):
         {"session_sha256": "r10"},
     ],
 )
-def test_a_robot_with_nothing_to_compare_with_cannot_be_judged_yet(result, changes):
+def test_moved_without_comparison_is_unknown(result, changes):
     rows = [result("r1", 0, lidar_serial="AG1"), result("r1", 1, MOVE, **({"lidar_serial": "AG1"} | changes))]
     assert history_of(as_table(rows)).robots == {"r1": "cannot_tell"}
 
 
-def test_a_result_that_failed_only_by_its_distance_from_the_cad_model_counts(result):
+def test_moved_far_from_nominal_counts(result):
     far = {"verdict": "fail", "findings": ("verdict.far_from_nominal",), "severities": ("error",)}
     assert history_of(as_table([result("r1", 0), result("r1", 1, MOVE, **far)])).robots == {"r1": "moved"}
 
 
-def test_shared_errors_count_only_between_profiles_or_methods(result):
+def test_moved_shared_errors_need_a_change(result):
+    """They count between profiles or methods only."""
+
     def state(**changes):
         rows = [result("r1", 0, shared=99.0), result("r1", 1, MOVE, shared=99.0, **changes)]
         return history_of(as_table(rows)).robots["r1"]
@@ -75,7 +77,7 @@ def test_shared_errors_count_only_between_profiles_or_methods(result):
     assert state(method="paper") == state(profile_sha256="0f") == "steady"
 
 
-def test_a_fleet_in_which_nothing_moved_names_a_robot_as_rarely_as_stated(result):
+def test_moved_false_alarm_rate_is_as_stated(result):
     rng = np.random.default_rng(0)
     rows = [result(f"r{r}", k, rng.normal(size=6)) for r in range(400) for k in range(5)]
     history = history_of(as_table(rows))

@@ -21,7 +21,7 @@ def folders(table):
     return table["folder"].to_pylist()
 
 
-def test_results_enter_the_table_in_the_order_of_robots_and_dates(registry, row):
+def test_registry_table_is_in_order(registry, row):
     late = row("r1", "2026-02-01", folder="r1/b", source="1")
     early = row("r1", "2026-01-01", folder="r1/a", source="2")
     other = row("r0", "2026-03-01", folder="r0/c", source="3")
@@ -30,7 +30,7 @@ def test_results_enter_the_table_in_the_order_of_robots_and_dates(registry, row)
     assert folders(registry.read_table()) == ["r0/c", "r1/a", "r1/b"]
 
 
-def test_a_table_that_is_lost_or_behind_is_written_again_from_the_folders(registry, row):
+def test_registry_lost_table_is_rewritten(registry, row):
     rows = [row("r1", folder=f"r1/{k}", source=str(k)) for k in range(3)]
     registry.consolidate(write(registry, rows[0]))
     for each in rows[1:]:
@@ -42,7 +42,8 @@ def test_a_table_that_is_lost_or_behind_is_written_again_from_the_folders(regist
     assert registry.consolidate(rebuild=True).equals(whole)
 
 
-def test_a_later_result_of_a_source_takes_the_place_of_the_earlier_which_is_kept(registry, row):
+def test_registry_later_result_replaces(registry, row):
+    """The earlier one is kept."""
     write(registry, row(folder="r1/old", source="s", finished="2026-01-01T00:00:00Z"), "result.json")
     write(registry, row(folder="r1/new", source="s", finished="2026-01-02T00:00:00Z"))
     assert folders(registry.consolidate()) == ["r1/new"]
@@ -69,7 +70,7 @@ def test_what_a_new_result_in_the_same_folder_lacks_is_kept(registry, row):
     assert aside.names() == ["a"], "nothing was lost: a failure, and the same files"
 
 
-def test_a_folder_is_replaced_whole_and_stays_where_writing_fails(registry, row):
+def test_registry_failed_write_keeps_folder(registry, row):
     write(registry, row(folder="r1/a", n_used=1), "old.txt")
     with pytest.raises(RuntimeError), registry.result("r1/a") as draft:
         (draft / "half.txt").write_text("")

@@ -35,7 +35,7 @@ def registry(row, tmp_path):
     return place
 
 
-def test_the_page_names_the_robot_that_moved_and_escapes_names(registry):
+def test_report_moved_robot_is_escaped(registry):
     text = FleetReport.of(registry).page()
     assert "<b>&lt;r1&gt;</b>" in text and "<r1>" not in text
     assert "fleet.signal" in text

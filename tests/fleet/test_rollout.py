@@ -119,7 +119,7 @@ def test_a_robot_that_refuses_its_result_stops_it(registry, targets, add):
 
 @pytest.mark.usefixtures("whole")
 @pytest.mark.parametrize("name", ["a}]}, x: {to: /tmp", "$(touch x)", "../r1", "r 9", "-oProxyCommand=x"])
-def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(registry, targets, name):
+def test_rollout_hostile_names_do_nothing(registry, targets, name):
     row = {
         "robot": name,
         "date": "2026-01-05T10:00:00Z",

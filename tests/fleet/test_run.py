@@ -30,7 +30,8 @@ def run(root, registry, client, **changes):
     return run_fleet(find_jobs(Storage.at(root)), settings, client), settings.opened()
 
 
-def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fleet_root, tmp_path, client):
+def test_fleet_run_every_session_has_a_row(fleet_root, tmp_path, client):
+    """A session without a result has a cause."""
     before = contents(fleet_root)
     done, registry = run(fleet_root, tmp_path / "registry", client)
     assert (done.n_new, done.n_held) == (3, 0)
@@ -77,7 +78,7 @@ def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):
     assert row["status"] == "ok"
 
 
-def test_ctrl_c_at_a_terminal_ends_all_processes_with_one_line(fleet_root, tmp_path):
+def test_fleet_run_interrupt_ends_cleanly(fleet_root, tmp_path):
     words = [
         *(sys.executable, "-m", "lce_rig", "fleet", "run"),
         str(fleet_root),

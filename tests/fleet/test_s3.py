@@ -70,7 +70,7 @@ def bucket():
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_the_same_sessions_give_the_same_files_in_a_store_and_on_a_disk(fleet_root, tmp_path, bucket):
+def test_fleet_s3_files_equal_those_on_disk(fleet_root, tmp_path, bucket):
     here = tmp_path / "registry"
     with bucket.reached() as (fs, path):
         fs.put(f"{fleet_root}/", f"{path}/sessions", recursive=True)

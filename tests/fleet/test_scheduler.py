@@ -37,7 +37,7 @@ def test_two_fleets_at_once_have_their_own_dashboards():
 
 
 @pytest.mark.long
-def test_a_recording_is_calibrated_by_a_cluster_that_runs_already(recorded, capsys, tmp_path):
+def test_fleet_running_cluster_calibrates(recorded, capsys, tmp_path):
     words = ["fleet", "run", str(recorded), "--registry", str(tmp_path / "registry")]
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as running:
         address = running.scheduler_address

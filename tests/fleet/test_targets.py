@@ -16,7 +16,7 @@ def write(path, text):
     return path
 
 
-def test_a_target_is_found_in_the_file_beside_the_session_or_the_one_given(tmp_path):
+def test_find_target_beside_the_session(tmp_path):
     session = tmp_path / "session"
     session.mkdir()
     with pytest.raises(UsageError):
@@ -33,14 +33,14 @@ def test_a_target_is_found_in_the_file_beside_the_session_or_the_one_given(tmp_p
 
 
 @pytest.mark.parametrize("text", ["", "[heron]"])
-def test_a_file_that_lists_no_targets_is_not_told_how_to_write_a_profile(tmp_path, text):
+def test_targets_empty_file_gets_own_advice(tmp_path, text):
     with pytest.raises(ProfileError) as caught:
         read_targets(write(tmp_path / "deploy.yaml", text))
     assert "deploy.yaml" in caught.value.what and "targets:" in caught.value.hint
     assert "rigs new" not in caught.value.hint
 
 
-def test_a_target_that_names_isaac_gets_the_urdf_that_it_was(tmp_path):
+def test_target_isaac_format_becomes_urdf(tmp_path):
     text = "targets: {heron: {to: /opt, formats: [isaac]}, kestrel: {to: /opt, formats: [isaac, urdf]}}"
     targets = read_targets(write(tmp_path / "deploy.yaml", text))
     assert [target.formats for target in targets.values()] == [("urdf",), ("urdf",)]
@@ -86,7 +86,7 @@ def test_places_are_read_as_scp_reads_them(to, host, path):
         "to: /opt\n    keep: 1",
     ],
 )
-def test_what_a_shell_or_ssh_could_take_for_something_else_is_refused(tmp_path, text):
+def test_targets_shell_words_are_refused(tmp_path, text):
     path = write(tmp_path / "deploy.yaml", f"targets:\n  kestrel:\n    {text}\n")
     with pytest.raises(ProfileError, match=r"deploy\.yaml:[34]:"):
         read_targets(path)

@@ -27,7 +27,7 @@ def with_topic(rles, topic):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, rles, name):
+def test_bag_events_come_in_order_of_time(tmp_path, rles, name):
     given = one_second()
     recording = opened(record(tmp_path / name, rles, given), rles)
     samples = list(recording.samples())
@@ -43,14 +43,14 @@ def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, 
     assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
 
 
-def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path, rles):
+def test_bag_reconstructed_images_are_events(tmp_path, rles):
     images = [replace(picture(k), channel="events") for k in range(3)]
     recording = opened(record(tmp_path / "r.bag", rles, [*images, sweep(0), sweep(1)]), rles)
     assert [s.channel for s in recording.samples() if isinstance(s, Image)] == ["events"] * 3
     assert recording.streams == {Stream("davis", "events", "images"), Stream("lidar", "", "scans")}
 
 
-def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path, rles):
+def test_bag_only_event_topic_is_taken(tmp_path, rles):
     path = record(tmp_path / "r.bag", rles, one_second(50))
     open_rig = with_topic(rles, None)
     recording = opened(path, open_rig)
@@ -63,7 +63,7 @@ def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path
             opened(path, rles, topics={"davis.events": wrong})
 
 
-def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path, rles):
+def test_bag_single_sensor_is_part_only(tmp_path, rles):
     samples = one_second(50)
     for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):
         path = record(tmp_path / f"{name}.bag", rles, [s for s in samples if isinstance(s, kind)])
@@ -78,7 +78,7 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
     assert has_note([caught.value.hint], "/velodyne_points", "PointCloud2, 1")
 
 
-def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path, rles):
+def test_bag_empty_event_topic_reads_images(tmp_path, rles):
     from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
     from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 

@@ -37,7 +37,7 @@ def test_samples_come_back_as_they_were(tmp_path, rles, name):
         assert np.array_equal(found_column, np.concatenate([getattr(p, column) for p in events])), column
 
 
-def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path, rles):
+def test_bag_recorder_colour_and_timeless(tmp_path, rles):
     colour = picture(0, (20, 30, 3))
     given = replace(sweep(0), offset_ns=None, host_ns=None)
     images, scans = read(record(tmp_path / "r.bag", rles, [colour, given]), rles)
@@ -61,7 +61,8 @@ def test_places_where_no_bag_can_be_are_refused(tmp_path, rles, path):
         BagRecorder(tmp_path / path, rles)
 
 
-def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(tmp_path, rles):
+def test_bag_recorder_refuses_unknown(tmp_path, rles):
+    """Samples of known sensors are kept."""
     with BagRecorder(tmp_path / "r.bag", rles) as recorder:
         recorder.write(picture(0))
         for stranger, name in (

@@ -47,7 +47,7 @@ def test_points_without_a_return_are_dropped_and_counted(room):
     assert np.isfinite(reading.scan.points).all()
 
 
-def test_a_cloud_without_valid_points_or_coordinates_is_refused(room):
+def test_cloud_without_points_is_refused(room):
     invalid = room[:3].copy()
     invalid["x"] = np.nan
     for cloud in (invalid, room[:0], drop_fields(room, "z")):
@@ -62,7 +62,7 @@ def test_rings_go_by_several_names(room, name):
     assert reading.scan.ring.dtype == np.int16 and reading.notes == ()
 
 
-def test_rings_are_told_from_elevations_where_there_is_no_field(room):
+def test_cloud_rings_come_from_elevations(room):
     reading = reading_of(drop_fields(room, "ring"), "lidar", FIRST, "here")
     np.testing.assert_array_equal(reading.scan.ring, room["ring"])
     assert len(reading.notes) == 1 and has_note(reading.notes, "no ring", "elevation angles")
@@ -98,7 +98,7 @@ def test_times_in_any_unit_become_ns_after_the_first_firing(room, values, unit_n
     assert scan.stamp_ns == STAMP_NS
 
 
-def test_stamps_of_the_last_packet_are_brought_to_the_first_firing(room):
+def test_cloud_last_stamp_becomes_first(room):
     span_ns = 5759 * 17_000
     negative = np.arange(-5759, 1) * 17e-6
     scan = reading_of(with_time(room, negative), "lidar", LAST, "here", STAMP_NS).scan
@@ -116,7 +116,7 @@ def test_stamps_of_the_last_packet_are_brought_to_the_first_firing(room):
 @pytest.mark.parametrize(
     "values", [np.zeros(5760), np.full(5760, np.nan), (1.7e9 + np.arange(5760) * 17e-6).astype("f4")]
 )
-def test_times_that_say_nothing_count_as_absent_and_that_is_said(room, values):
+def test_cloud_useless_times_count_as_absent(room, values):
     reading = reading_of(with_time(room, values), "lidar", FIRST, "here", STAMP_NS)
     assert reading.scan.offset_ns is None
     assert len(reading.notes) == 1 and has_note(reading.notes, "field 'time'", "no times")
@@ -132,7 +132,7 @@ def test_intensity_may_be_called_reflectivity_or_be_absent(room):
 
 
 @pytest.mark.parametrize("factor", [1000.0, 100.0])
-def test_coordinates_that_are_no_metres_are_refused_with_a_question(room, factor):
+def test_cloud_other_units_are_refused(room, factor):
     cloud = room.copy()
     for axis in "xyz":
         cloud[axis] *= factor
@@ -157,7 +157,7 @@ def rosette(n=20000):
     return cloud
 
 
-def test_lines_that_are_no_rings_are_read_where_the_model_has_none_and_else_refused():
+def test_cloud_lines_need_ringless_model():
     with pytest.raises(SourceError) as caught:
         reading_of(rosette(), "lidar", FIRST, "livox")
     assert "Livox" in caught.value.hint

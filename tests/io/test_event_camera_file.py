@@ -33,7 +33,7 @@ def images_of(recording):
     return [s for s in recording.samples() if isinstance(s, Image)]
 
 
-def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path, rles):
+def test_davis_file_gives_events_and_frames(tmp_path, rles):
     recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, FRAMES), rles)
     assert recording.n_samples >= 1  # by the size of the file, most of which are events
     assert set(recording.streams) == {EVENT_STREAM, FRAME_STREAM}
@@ -51,7 +51,7 @@ def test_frames_alone_are_a_recording_too(tmp_path, rles):
     assert has_note(recording.notes, "no stream")
 
 
-def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(tmp_path, rles):
+def test_davis_file_frames_need_a_channel(tmp_path, rles):
     channels = {"events": rles.cameras["davis"].channels["events"]}
     path = write_davis(tmp_path / "a.aedat4", PIECES, FRAMES)
     recording = opened(path, changed(rles, cameras__davis__channels=channels))
@@ -86,7 +86,7 @@ def test_serial_numbers_in_heads_of_files_are_told(tmp_path, rles):
     assert found == [{"davis": "00000499"}, {"davis": "00050423"}, {}]
 
 
-def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path, rles):
+def test_event_file_misfits_are_refused(tmp_path, rles):
     write_aedat4(tmp_path / "none.aedat4", [])
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     with pytest.raises(SourceError, match=r"none\.aedat4"):
@@ -100,7 +100,7 @@ def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path, 
         opened(tmp_path / "a.aedat4", rles, camera="left")
 
 
-def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path, rles):
+def test_event_file_takes_first_camera(tmp_path, rles):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     both = changed(rles, cameras__right=rles.cameras["davis"])
     assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
@@ -108,7 +108,7 @@ def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path, rl
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 
 
-def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path, rles):
+def test_davis_torn_file_gives_its_beginning(tmp_path, rles):
     whole = write_davis(tmp_path / "whole.aedat4", PIECES, FRAMES).read_bytes()
     (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 5])
     recording = opened(tmp_path / "torn.aedat4", rles)

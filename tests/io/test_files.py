@@ -78,7 +78,7 @@ def test_binary_ply_is_read(tmp_path, form, order):
     assert all(np.array_equal(read[name], POINTS[name]) for name in POINTS.dtype.names)
 
 
-def test_text_ply_is_read_with_what_stands_before_its_vertices():
+def test_ply_text_skips_leading_elements():
     header = HEADER.format("ascii").replace(
         "element vertex", "element device 1\nproperty int id\nelement vertex"
     )
@@ -147,7 +147,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path_factory, name, d
         assert name in error.what and "\n" not in error.what
 
 
-def test_deep_pixels_that_are_not_finite_are_no_reason_to_stop():
+def test_to_8_bit_infinite_pixels_are_zero():
     pixels = np.linspace(-3e38, 3e38, 64, dtype=np.float32).reshape(8, 8)
     pixels[0, 0] = np.nan
     assert to_8_bit(pixels)[0, 0] == 0 and to_8_bit(pixels).max() == 255

@@ -87,7 +87,7 @@ def test_missing_folders_and_kinds_are_named(make_folder, rig, tmp_path):
         open_recording(tmp_path / "a.avi", rig)
 
 
-def test_two_folders_of_clouds_without_telling_names_are_not_guessed(make_folder, rig):
+def test_folder_ambiguous_clouds_are_refused(make_folder, rig):
     path = make_folder(names=("img", "one"))
     make_folder(names=("img", "two"))
     with pytest.raises(SourceError):
@@ -100,7 +100,7 @@ TWO = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
 @pytest.mark.parametrize(
     "names", [("img/left", "img/right"), ("left", "right"), ("images/Left", "images/Right")]
 )
-def test_pictures_in_folders_named_after_cameras_go_with_the_same_cloud(make_folder, names):
+def test_folder_of_cameras_shares_a_cloud(make_folder, names):
     make_folder(images=("00000", "00001"), clouds=("00000", "00001", "00002"), names=(names[0], "pcd"))
     recording = open_recording(make_folder(("00001", "00002", "00003"), (), (names[1], "pcd")), TWO)
     seen = [[(i.sensor, i.channel, int(i.pixels.max())) for i in p.read()[0]] for p in recording.pairs]
@@ -130,7 +130,7 @@ def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
     assert [len(pair.read()[0]) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
 
 
-def test_las_without_its_reader_is_one_error_that_names_the_extra(make_folder, rig, monkeypatch):
+def test_folder_las_without_reader_fails(make_folder, rig, monkeypatch):
     path = make_folder()
     for cloud in (path / "pcd").iterdir():
         cloud.rename(cloud.with_suffix(".las"))
@@ -151,7 +151,7 @@ def test_las_without_its_reader_is_one_error_that_names_the_extra(make_folder, r
         ("acfr_vlp16", 10, "equal file names"),
     ],
 )
-def test_recordings_by_others_are_paired_as_their_makers_meant(recordings, rig, name, n_pairs, method):
+def test_folder_recordings_pair_as_intended(recordings, rig, name, n_pairs, method):
     recording = open_recording(recordings / name, rig)
     assert len(recording.pairs) == n_pairs and method in recording.notes[0]
     _, (scan,), _ = recording.pairs[-1].read()
@@ -198,7 +198,8 @@ def test_only_names_that_are_times_are_taken_for_times():
 @given(
     st.lists(st.integers(0, 30), unique=True), st.lists(st.integers(0, 30), unique=True), st.floats(0.01, 9)
 )
-def test_pairs_by_time_are_one_to_one_and_within_the_tolerance(left, right, tolerance_s):
+def test_pairs_by_time_are_one_to_one(left, right, tolerance_s):
+    """Each pair is within the tolerance."""
     images, clouds = [f"{v}.0" for v in left], [f"{v}.25" for v in right]
     try:
         pairs, reason = pair_names(images, clouds, tolerance_s, may_count=False)

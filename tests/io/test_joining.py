@@ -77,7 +77,7 @@ def names(recordings):
     ]
 
 
-def test_each_recording_joins_those_before_it_that_lack_its_sensors(rles):
+def test_join_by_missing_sensors(rles):
     events_only = Listed("e", [(EVENTS, 0.0)])
     for given, wanted in [
         ([lidar(), camera()], [["lidar.bag", "events.aedat4"]]),
@@ -92,13 +92,13 @@ def test_each_recording_joins_those_before_it_that_lack_its_sensors(rles):
         assert names(join_recordings(given, rles)) == wanted
 
 
-def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rles):
+def test_join_second_copy_is_skipped(rles):
     (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rles)
     assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
     assert len(list(joined.samples())) == 3
 
 
-def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rles):
+def test_join_samples_come_in_order_of_time(rles):
     (joined,) = join_recordings([lidar(), camera()], rles)
     kinds = [type(s).__name__ for s in joined.samples()]
     assert kinds == ["Scan", "Events", "Image", "Scan", "Events", "Image", "Scan"]
@@ -110,7 +110,7 @@ def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rles):
     assert kinds == ["Image", "Scan", "Image", "Scan", "Scan"]
 
 
-def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rles):
+def test_join_key_ignores_the_order(rles):
     one, other = JoinedRecording([lidar(), camera()], rles), JoinedRecording([camera(), lidar()], rles)
     assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rles).key
 
@@ -171,7 +171,7 @@ def test_a_part_that_is_torn_does_not_end_the_others(rles):
     assert len(found) == 7
 
 
-def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rles):
+def test_join_missing_sensor_is_refused(rles):
     require_sensors(JoinedRecording([lidar(), camera()], rles), rles)
     with pytest.raises(SourceError, match=r"events\.aedat4"):
         require_sensors(camera(), rles)
@@ -180,7 +180,7 @@ def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rle
     assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 
 
-def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rles):
+def test_merge_untimed_keep_their_place(rles):
     image = sample(FRAMES, 0.05)
     assert isinstance(image, Image)
     timeless = replace(image, stamp_ns=None)

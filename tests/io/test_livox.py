@@ -66,7 +66,7 @@ def of_model(model, **changes):
 
 
 @pytest.mark.parametrize(("package", "is_ros1"), [("livox_ros_driver", True), ("livox_ros_driver2", False)])
-def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(tmp_path, package, is_ros1):
+def test_livox_both_drivers_are_accumulated(tmp_path, package, is_ros1):
     path = write_custom(tmp_path / "bag", package, 25, is_ros1)
     scans = scans_of(path, of_model("Avia"))
     # At one scan per second: two whole ones, and what is left.
@@ -80,7 +80,8 @@ def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(tmp_pat
 
 
 @pytest.mark.parametrize(("model", "n_kept"), [("Avia", 160), ("Mid-360", 80), ("unstructured", 160)])
-def test_tags_are_read_as_the_model_means_them_and_may_be_missing(model, n_kept):
+def test_livox_tags_follow_the_model(model, n_kept):
+    """Missing tags remove no point."""
     index = np.arange(N_POINTS)
     cloud = np.zeros(N_POINTS, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("tag", "u1"), ("timestamp", "f8")])
     cloud["x"], cloud["y"], cloud["tag"] = 3.0, 0.01 * index, 16 * (index % 2) + (index % 5 == 2)

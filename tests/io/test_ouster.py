@@ -54,7 +54,7 @@ def test_points_are_those_of_ousters_own_library(tmp_path, profile):
     np.testing.assert_allclose(points[range_m > 0], wanted[range_m > 0], atol=1e-5)
 
 
-def test_metadata_in_groups_as_newer_sensors_write_them_are_the_same(tmp_path):
+def test_ouster_grouped_metadata_is_equal(tmp_path):
     flat = write_metadata(tmp_path / "flat.json", "LEGACY")
     beams = ("beam_altitude_angles", "beam_azimuth_angles", "beam_to_lidar_transform")
     document = {
@@ -136,7 +136,8 @@ def test_what_is_missing_or_not_read_is_named(tmp_path, rig):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(tmp_path, rig, data):
+def test_ouster_damaged_gives_source_error(tmp_path, rig, data):
+    """Any beginning and any flipped byte: scans or a SourceError."""
     path = tmp_path / "drive.pcap"
     path.unlink(missing_ok=True)
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 1.0)

@@ -108,7 +108,7 @@ def test_wiresharks_own_format_is_read(frames, rig, tmp_path):
     check_scans(read(write_pcapng(tmp_path / "a.pcapng", frames), rig)[0])
 
 
-def test_arrivals_in_ns_and_payloads_are_read_as_they_were_written(datagrams, tmp_path):
+def test_pcap_datagrams_are_read_back(datagrams, tmp_path):
     path = tmp_path / "a.pcap"
     write_datagrams(path, datagrams)
     back = list(PcapFile(path).datagrams())
@@ -141,7 +141,8 @@ def test_a_torn_file_is_read_up_to_where_it_is_torn(frames, rig, tmp_path):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(suffix, frames, rig, tmp_path, data):
+def test_pcap_damaged_gives_source_error(suffix, frames, rig, tmp_path, data):
+    """Any beginning and any flipped byte: scans or a SourceError."""
     path = tmp_path / f"a.{suffix}"
     whole = (write_pcap if suffix == "pcap" else write_pcapng)(path, frames[:90]).read_bytes()
     path.write_bytes(data.draw(damaged(whole)))
@@ -185,7 +186,8 @@ def test_of_several_sensors_the_profiles_is_taken(datagrams, rig, tmp_path):
     assert all(address in caught.value.what for address in (SENSOR, "192.168.1.77"))
 
 
-def test_no_packets_whole_ones_or_whole_revolutions_are_errors(frames, rig, tmp_path):
+def test_pcap_no_revolution_is_an_error(frames, rig, tmp_path):
+    """No packets of the sensor, cut packets, or less than one revolution."""
     with pytest.raises(SourceError, match="243"):
         read(write_pcap(tmp_path / "a.pcap", frames, snaplen=96), rig)
     mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns"))

@@ -43,7 +43,7 @@ def read(folder, rig):
 
 
 @pytest.mark.parametrize(("ros", "bag"), list(enumerate(KINDS, start=1)))
-def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(tmp_path, rles, ros, bag):
+def test_recorded_folder_is_one_recording(tmp_path, rles, ros, bag):
     folder = tmp_path / "kept"
     n_pictures = fill(folder, rles, ros)
     assert {each.name for each in folder.iterdir()} == {bag, "lidar.pcap"}
@@ -61,7 +61,7 @@ def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(tmp_
         BagRecorder.in_folder(folder, rles, ros)
 
 
-def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path, rles):
+def test_recorded_folder_skips_empty_file(tmp_path, rles):
     folder = tmp_path / "kept"
     fill(folder, rles)
     (folder / "events.aedat4").write_bytes(b"")
@@ -122,7 +122,7 @@ def fill_with_pictures(folder, place="webcam", n=5, torn=None):
 
 
 @pytest.mark.parametrize("paths", [["."], ["lidar.pcap", "webcam"], ["webcam", "lidar.pcap"]])
-def test_pictures_named_after_their_times_are_joined_with_packets(tmp_path, rlfs, paths):
+def test_recorded_images_join_packets(tmp_path, rlfs, paths):
     fill_with_pictures(tmp_path / "day", torn=3)
     (joined,) = join_recordings(open_recordings([tmp_path / "day" / p for p in paths], rlfs), rlfs)
     samples = list(joined.samples())
@@ -146,7 +146,8 @@ def test_two_days_of_pictures_and_packets_stay_apart(tmp_path, rlfs):
         list(check_overlap(joined[1].samples(), rlfs, []))  # type: ignore[attr-defined]
 
 
-def test_pictures_without_times_or_without_scans_are_refused(tmp_path, rlfs):
+def test_recorded_images_without_scans_fail(tmp_path, rlfs):
+    """Images without times fail, too."""
     fill_with_pictures(tmp_path)
     with pytest.raises(SourceError):
         open_recordings([tmp_path / "webcam"], rlfs)

@@ -67,9 +67,8 @@ def test_every_message_is_read_with_its_header_stamp(tmp_path, rig, room, pictur
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
-def test_the_storage_file_alone_and_a_folder_without_metadata_are_read(
-    tmp_path, rig, write_bag, stream, kind
-):
+def test_bag_without_metadata_is_read(tmp_path, rig, write_bag, stream, kind):
+    """Also the storage file alone."""
     folder = write_bag(tmp_path / "bag", kind, stream(3))
     (file,) = (p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
     assert len(read(open_recording(file, rig))[0]) == 3
@@ -150,9 +149,7 @@ def test_image_of_two_planes_is_decoded(image_message, encoding, n_padding, coun
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_compressed_pictures_are_found_beside_the_profiles_topic(
-    tmp_path, rig, room, picture, write_bag, cloud_message, suffix
-):
+def test_bag_compressed_images_are_found(tmp_path, rig, room, picture, write_bag, cloud_message, suffix):
     data = cv2.imencode(suffix, picture)[1].ravel()
     fields = {"stamp_ns": T0_NS, "format": f"bgr8; {suffix[1:]} compressed bgr8", "data": data}
     messages = [
@@ -163,7 +160,7 @@ def test_compressed_pictures_are_found_beside_the_profiles_topic(
     assert np.abs(image.pixels.astype(int) - picture).mean() < (8 if suffix == ".jpg" else 1e-9)
 
 
-def test_topics_can_be_given_and_those_that_are_not_there_are_listed(tmp_path, rig, write_bag, stream):
+def test_bag_wrong_topics_list_the_others(tmp_path, rig, write_bag, stream):
     bag = write_bag(tmp_path / "bag", "ros1", stream(2, cam="/front/image", lidar="/points"))
     with pytest.raises(SourceError) as caught:
         open_recording(bag, rig)
@@ -176,14 +173,14 @@ def test_topics_can_be_given_and_those_that_are_not_there_are_listed(tmp_path, r
             open_recording(bag, rig, SourceOptions(topics={**topics, **wrong}))
 
 
-def test_a_channel_whose_topic_is_not_in_the_bag_is_done_without(tmp_path, write_bag, stream):
+def test_bag_absent_channel_is_skipped(tmp_path, write_bag, stream):
     rig = load_rig("rles")
     bag = write_bag(tmp_path / "bag", "ros1", stream(2, cam="/davis/image_raw"))
     images, scans = read(open_recording(bag, rig))
     assert {i.channel for i in images} == {"frames"} and len(scans) == 2
 
 
-def test_stamps_that_run_backwards_or_twice_are_left_out_and_counted(
+def test_bag_backward_times_are_skipped(
     tmp_path, rig, room, picture, write_bag, cloud_message, image_message
 ):
     order = [0, 1, 3, 2, 3, 4]
@@ -225,7 +222,7 @@ def test_messages_without_stamps_take_the_time_of_receipt(
     assert has_note(recording.notes, CAM, "no timestamps", "of receipt")
 
 
-def test_messages_that_contradict_themselves_are_left_out_and_counted(
+def test_bag_broken_messages_are_counted(
     tmp_path, rig, room, picture, write_bag, cloud_message, image_message
 ):
     def messages(n_bad):
@@ -253,9 +250,7 @@ def _only_file(bag):
 
 @pytest.mark.parametrize("name", ["killed.bag", "killed.mcap", "killed.db3"])
 @pytest.mark.parametrize("is_beside_a_whole_one", [False, True])
-def test_a_bag_whose_recorder_was_killed_is_named_with_the_tool_that_repairs_it(
-    tmp_path, rig, write_bag, stream, name, is_beside_a_whole_one
-):
+def test_bag_unfinished_names_repair_tool(tmp_path, rig, write_bag, stream, name, is_beside_a_whole_one):
     kind = {".bag": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}[name[-4:].replace("mcap", ".mcap")]
     whole = _only_file(write_bag(tmp_path / "bag", kind, stream(30)))
     folder = tmp_path / "folder"
@@ -272,7 +267,7 @@ def test_a_bag_whose_recorder_was_killed_is_named_with_the_tool_that_repairs_it(
     assert ("recover" if kind == "mcap" else "reindex") in caught.value.hint
 
 
-def test_damage_in_the_middle_of_a_bag_costs_what_comes_behind_it(tmp_path, rig, write_bag, stream):
+def test_bag_damage_ends_the_samples(tmp_path, rig, write_bag, stream):
     file = write_bag(tmp_path / "bag", "ros1", stream(60))
     damaged = bytearray(file.read_bytes())
     place = damaged.index(b"op=\2", len(damaged) // 2)
@@ -288,7 +283,8 @@ def test_damage_in_the_middle_of_a_bag_costs_what_comes_behind_it(tmp_path, rig,
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(data=st.data())
-def test_any_beginning_and_any_flipped_byte_give_data_or_a_source_error(small_bags, rig, kind, data):
+def test_bag_damaged_gives_source_error(small_bags, rig, kind, data):
+    """Any beginning and any flipped byte: data or a SourceError."""
     whole, path = small_bags[kind]
     path.write_bytes(data.draw(damaged(whole)))
     try:
@@ -315,7 +311,7 @@ def small_bags(tmp_path_factory, write_bag, room, cloud_message, image_message):
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", ".pcap", ".pcapng"])
-def test_pipes_and_devices_in_place_of_recordings_are_refused_at_once(tmp_path, rig, suffix):
+def test_open_pipes_and_devices_are_refused(tmp_path, rig, suffix):
     os.mkfifo(tmp_path / f"pipe{suffix}")
     (tmp_path / f"zero{suffix}").symlink_to("/dev/zero")
     for name in ("pipe", "zero"):

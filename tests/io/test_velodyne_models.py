@@ -88,7 +88,7 @@ def test_a_model_without_packets_is_named():
 
 
 @pytest.mark.parametrize("name", ["packets.bag", "packets"])
-def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(tmp_path, rig, name):
+def test_velodyne_bag_scans_equal_pcap(tmp_path, rig, name):
     product = velodyne.READ[0]
     payloads = packets_of(product, 2.3, 0.002)
     arrivals_ns = [10**18 + product.packet_ns(is_dual=False) * (k + 1) for k in range(len(payloads))]
@@ -105,7 +105,7 @@ def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(tmp_path, rig,
     assert any("vertical offsets" in note for note in recording.notes)
 
 
-def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path, rig):
+def test_velodyne_bag_other_model_is_named(tmp_path, rig):
     payloads = packets_of(velodyne.product_of("HDL-32E") or velodyne.READ[0], 0.2, 0.002)
     bag = write_packets(tmp_path / "packets", payloads, [10**18 + k for k in range(len(payloads))])
     recording = open_recording(bag, rig, SourceOptions(topics={"lidar": "/velodyne_packets"}, is_part=True))
@@ -130,7 +130,7 @@ def einride(recordings):
 
 
 @pytest.mark.dataset
-def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings):
+def test_einride_payloads_lose_no_packet(recordings):
     stream = stream_of()
     fields = einride(recordings)
     scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]
@@ -148,7 +148,7 @@ def nebula_packets(recordings):
 
 
 @pytest.mark.dataset
-def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(recordings):
+def test_nebula_recording_uses_arrival(recordings):
     stream = stream_of()
     sent = nebula_packets(recordings)
     scans = [scan for host_ns, body in sent if (scan := stream.push_data(body, host_ns)) is not None]
@@ -160,7 +160,7 @@ def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(record
 
 
 @pytest.mark.dataset
-def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings, rig):
+def test_mrpt_recording_clock_is_in_doubt(recordings, rig):
     path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_vlp16_gps.pcap"
     recording = PcapRecording(path, rig, SourceOptions())
     scans = list(recording.samples())

@@ -47,7 +47,7 @@ def test_scans_go_from_seam_to_seam_behind_the_sensor(packets):
         assert abs(azimuth[0]) > 179.5
 
 
-def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolutions(packets):
+def test_velodyne_cut_revolutions_are_lost(packets):
     stream = stream_of()
     scans = push(stream, packets[30:-30])
     assert stream.finish() is None
@@ -56,7 +56,7 @@ def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolution
     assert stream.losses.n("packet.lost") == 0
 
 
-def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does(packets):
+def test_velodyne_losses_follow_the_counter(packets):
     rng = np.random.default_rng(0)
     is_kept = rng.random(len(packets)) > 0.3
     is_kept[[0, -1]] = True
@@ -154,7 +154,7 @@ UNSYNCHRONISED = {
 
 
 @pytest.mark.parametrize("name", sorted(UNSYNCHRONISED))
-def test_time_that_cannot_be_trusted_is_said_and_replaced_by_arrival(name):
+def test_velodyne_bad_clock_uses_arrival(name):
     clock, code = UNSYNCHRONISED[name]
     truth = room_scans(3, T0_NS + 500_000_000)
     stream = stream_of()
@@ -199,7 +199,7 @@ def test_the_profile_may_want_the_hosts_time(packets):
     )
 
 
-def test_packets_without_any_arrival_give_scans_without_stamps(packets):
+def test_velodyne_no_arrival_has_no_stamp(packets):
     scans = push(stream_of(), packets, delay_ns=None)
     assert stamps(scans) == [None] * 5
     assert scans[0].host_ns is None
@@ -267,7 +267,7 @@ def test_a_damaged_data_packet_is_refused(spoil, payload):
 
 
 @given(st.binary(max_size=600))
-def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload):
+def test_position_packet_is_read_or_refused(payload):
     for body in (payload, payload.ljust(velodyne.POSITION_BYTES, b"\0")[: velodyne.POSITION_BYTES]):
         try:
             read = read_position_packet(body)

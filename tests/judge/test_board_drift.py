@@ -37,7 +37,7 @@ def watched(calibration: Calibration, seed: int) -> BoardDrift:
     return found
 
 
-def test_a_rotation_that_a_translation_hides_axis_by_axis_is_seen_jointly() -> None:
+def test_board_drift_hidden_rotation_is_seen() -> None:
     hidden = np.array([0, 0.05, 0, np.radians(1.01), 0, 0])
     for seed in range(3):
         board = watched(deployed(hidden), seed)

@@ -38,7 +38,7 @@ def sound():
     return [simulate_two(12, seed) for seed in range(N_SOUND)]
 
 
-def test_pictures_alone_find_where_cameras_sit_as_well_as_they_claim(sound):
+def test_images_pose_error_fits_covariance(sound):
     found = [pose_from_images(observed(session)) for session in sound]
     errors = np.array([difference(each.T_second_first, T_RIGHT_LEFT) for each in found])
     assert np.degrees(np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, axis=1)))) < 0.03
@@ -64,7 +64,7 @@ def test_sound_sessions_are_not_questioned(sound):
     ids=["turned", "shifted"],
 )
 @pytest.mark.parametrize("seed", range(2))
-def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge, figure, size):
+def test_images_nudged_camera_is_found(seed, nudge, figure, size):
     found = findings(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
     (change,) = (finding for finding in found if finding.code == "verdict.moved")
     assert change.subject.split(" to ") == [LEFT, RIGHT]
@@ -73,7 +73,7 @@ def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_they_put_boards(seed):
+def test_stale_extrinsics_contradict_images(seed):
     """An extrinsic made before the camera was turned, captures of both from after it."""
     session = simulate_two(12, seed)
     left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
@@ -85,7 +85,7 @@ def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_the
     assert 0.025 < apart.figure("rms_m") < 0.055
 
 
-def test_cameras_that_wrongly_scaled_lenses_see_the_boards_in_different_places(sound):
+def test_scaled_lens_scatters_the_boards(sound):
     session = observed(sound[0])
     longer = []
     for left, right in session:
@@ -119,7 +119,7 @@ def test_few_boards_tell_nothing_and_none_no_pair(sound):
     assert findings(three) == []
 
 
-def test_boards_are_paired_by_their_scan_whatever_their_captures_are_called(sound):
+def test_shared_boards_are_paired_by_scan(sound):
     pairs = observed(sound[3])
     left = {o.capture: o for o, _ in pairs}
     renamed = {f"{k:06d}": replace(o, capture=f"{k:06d}") for k, (_, o) in enumerate(pairs, 100)}

@@ -8,11 +8,11 @@ RIG = load_rig("rlfs")
 GOOD = Metrics(mpe_m=0.008, mee_m=0.006, reprojection_px=0.1)
 
 
-def test_one_board_that_the_lidar_missed_is_no_contradiction():
+def test_one_board_missed_is_not_reported():
     assert contradictions(GOOD, RIG, n_elsewhere=1, n_seen=30) == ()
 
 
-def test_many_boards_that_are_not_where_the_extrinsic_puts_them_are_one():
+def test_boards_elsewhere_are_one_finding():
     (doubt,) = contradictions(GOOD, RIG, n_elsewhere=10, n_seen=30)
     assert (doubt.code, doubt.figures) == ("verify.elsewhere", {"n_elsewhere": 10, "n_captures": 30})
 

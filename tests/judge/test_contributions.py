@@ -35,7 +35,7 @@ def sources(examination):
     return {each.source for each in examination.contributions}
 
 
-def test_a_sound_result_reports_the_sum_of_its_captures_and_its_profile(sound):
+def test_sound_covariance_is_the_sum(sound):
     estimate, examination = sound
     assert not any(source.startswith("contradiction") for source in sources(examination))
     of_profile = summed_covariance(estimate.sensitivities)

@@ -55,7 +55,7 @@ def through(rig: Rig, camera: str, source: str, board: Observation) -> Observati
     return replace(board, image=board_from_pose(corners, solved))
 
 
-def test_alike_cameras_that_were_exchanged_are_found_by_their_mounting() -> None:
+def test_exchanged_like_cameras_are_found() -> None:
     session = simulate_two(12, 1)
     assert exchanged(calibrated(RIG, session, (LEFT, RIGHT))) == []
     found = calibrated(RIG, session, (RIGHT, LEFT))
@@ -65,7 +65,7 @@ def test_alike_cameras_that_were_exchanged_are_found_by_their_mounting() -> None
 
 
 @pytest.mark.long
-def test_cameras_of_other_lenses_that_were_exchanged_are_found_by_their_images() -> None:
+def test_exchanged_other_lenses_are_found() -> None:
     rig, session = with_longer_right_lens(), simulate_two(16, 2)
     sound = {name: [through(rig, name, name, board) for board in session[name]] for name in (LEFT, RIGHT)}
     assert exchanged(calibrated(rig, sound, (LEFT, RIGHT))) == []

@@ -21,7 +21,7 @@ NEAR = Scene(distance_m=(0.6, 1.5), sigma_px=0.05)
         (WIDE, "radtan5", None),
     ],
 )
-def test_a_lens_model_that_does_not_fit_is_named_with_the_one_that_does(lens, model, other):
+def test_unfit_lens_model_names_a_better_one(lens, model, other):
     views = photograph(10, 4, replace(NEAR, lens=lens))
     start = lens if lens.model == MODELS[model].family else replace(lens, model="radtan", distortion=())
     found = model_findings(estimate_intrinsics(views, BOARD, start, MODELS[model], n_folds=0), BOARD)
@@ -31,7 +31,7 @@ def test_a_lens_model_that_does_not_fit_is_named_with_the_one_that_does(lens, mo
         assert finding.figure("other_px") < 0.1 < finding.figure("rms_px")
 
 
-def test_the_noise_of_corners_is_measured_without_a_lens_on_a_bent_board():
+def test_corner_noise_on_bent_board_is_right():
     views = photograph(10, 4, Scene(bow_m=(0.004, 0.002)))
     # Two coordinates of 0.05 px each.
     assert corner_noise(views, BOARD).mean() == pytest.approx(0.07, rel=0.2)

@@ -10,7 +10,7 @@ from lce_rig.judge.session_check import match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD, simulate
 
 
-def test_the_candidate_where_the_picture_puts_the_board_is_taken_wherever_it_is_listed():
+def test_match_candidates_any_order_is_equal():
     first, second = simulate(2, seed=0)
     for places in ([first.lidar, second.lidar], [second.lidar, first.lidar]):
         found = match_candidates(Observation.of("a", first.image, places), BOARD, T_FORWARD)

@@ -66,7 +66,7 @@ def test_planes_meet_once_the_motion_is_taken_off(
 
 
 @pytest.mark.parametrize("channel", ["frames", "events"])
-def test_the_lidars_board_is_drawn_where_the_picture_shows_it(
+def test_meetings_move_lidar_to_image_time(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
     for meeting in bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS).values():
@@ -80,7 +80,7 @@ def test_the_lidars_board_is_drawn_where_the_picture_shows_it(
         assert meeting.way_m == pytest.approx(way_m, abs=0.005)
 
 
-def test_without_time_offsets_boards_are_taken_to_have_stood_still(
+def test_meetings_without_offsets_are_still(
     observations: dict[str, list[Observation]],
 ) -> None:
     still = calibration_of((result_of("frames", None),))

@@ -20,7 +20,7 @@ def covariance(rng):
 
 
 @pytest.mark.parametrize("lens", [NARROW, FISHEYE])
-def test_points_scatter_as_far_as_extrinsics_drawn_from_the_covariance_put_them(lens):
+def test_point_uncertainty_matches_samples(lens):
     rng = np.random.default_rng(0)
     cov = covariance(rng)
     found = point_uncertainties(T_FORWARD, cov, lens)
@@ -41,7 +41,7 @@ def test_points_scatter_as_far_as_extrinsics_drawn_from_the_covariance_put_them(
         assert uncertainty.corner_px == pytest.approx(off_px[1:].max(), rel=0.03)
 
 
-def test_a_lens_that_ends_before_the_corner_is_taken_as_far_as_it_goes():
+def test_point_uncertainty_ends_with_lens():
     folding = replace(CAMERA, distortion=(-0.6, 0.0, 0.0, 0.0, 0.0))
     assert np.isnan(folding.unproject(np.array([0.0, 0.0]))).any()
     found = point_uncertainties(T_FORWARD, covariance(np.random.default_rng(1)), folding)

@@ -73,7 +73,7 @@ def test_a_sensor_that_moved_before_the_last_captures_fails(n_moved: int, angle_
     assert first.figures["neighbour"] == f"{14 - n_moved:06d}"
 
 
-def test_a_sensor_that_moved_after_the_first_captures_does_not_pass() -> None:
+def test_early_moved_sensor_does_not_pass() -> None:
     calibration = calibrated(moved(simulate(15, 3), range(2), turned(3.0, 0)))
     first = calibration.findings[0]
     assert (calibration.verdict, first.code) == ("marginal", "verdict.moved")
@@ -96,7 +96,7 @@ def test_the_last_capture_alone_is_named() -> None:
     assert finding.figures["capture"] == "000014"
 
 
-def test_outliers_that_err_by_themselves_are_no_moved_sensor() -> None:
+def test_lone_outliers_are_no_moved_sensor() -> None:
     rng = np.random.default_rng(5)
     for seed in range(4):
         boards = simulate(15, seed)

@@ -42,7 +42,7 @@ def test_sound_calibrations_spread_as_their_covariance_says():
     assert spread == pytest.approx(np.mean([one.reported_translation_m**2 for one in compared]), rel=0.15)
 
 
-def test_a_principal_point_that_one_session_takes_for_a_rotation_is_no_difference():
+def test_repeat_lens_turn_is_no_difference():
     """Sessions with lenses of their own are compared as they draw points."""
     moved = replace(CAMERA, cx_px=CAMERA.cx_px + 4.0)
     turn = -turn_of_lens(CAMERA)[:, 2] * 4.0
@@ -65,7 +65,8 @@ def test_uncertainties_that_are_too_small_are_found_out():
     assert compared.finding.figure("ratio") == compared.ratio
 
 
-def test_the_mean_lies_between_and_the_order_does_not_matter():
+def test_repeat_mean_ignores_the_order():
+    """The mean is weighted by the covariances."""
     sure = calibration(perturb(TRUTH, np.full(6, 1e-3)), 1e-4 * COV)
     rough = calibration(perturb(TRUTH, np.full(6, -1e-3)), COV)
     compared = compare_calibrations({"sure": sure, "rough": rough})
@@ -77,7 +78,8 @@ def test_the_mean_lies_between_and_the_order_does_not_matter():
 
 
 @pytest.mark.parametrize("correlation", [-1.0, 0.0, 0.7])
-def test_results_of_the_same_captures_are_not_accused_whatever_their_correlation(correlation):
+def test_repeat_same_captures_mostly_agree(correlation):
+    """For any correlation of the two results."""
     root = np.linalg.cholesky(COV)
     rng = np.random.default_rng(5)
     n_refused = 0

@@ -97,7 +97,7 @@ def test_few_usable_captures_of_many_are_a_doubt(estimate, verdict_of):
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(0.5, "pass"), (2.0, "marginal"), (9.0, "fail")])
-def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, factor, expected, verdict_of):
+def test_verdict_follows_the_deviation(estimate, factor, expected, verdict_of):
     target_deg = RIG.calibration.target_sigma_deg
     cov = np.diag([1e-8] * 3 + [(np.radians(factor * target_deg)) ** 2 / 3] * 3)
     verdict, reasons = verdict_of(replace(estimate, cov=cov))
@@ -106,7 +106,8 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
     assert {reason.code for reason in reasons} - {"verdict.rotation_uncertain"} == told
 
 
-def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimate):
+def test_contradiction_alone_does_not_fail(estimate):
+    """It widens the reported covariance."""
     cov = np.diag([1e-8] * 3 + [np.radians(9.0 * RIG.calibration.target_sigma_deg) ** 2 / 3] * 3)
     examination = replace(examined(estimate), cov=cov, cov_agreed=estimate.cov)
     verdict, reasons = judge(estimate, examination, RIG, "cam", "lidar", 20)
@@ -118,7 +119,7 @@ def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimat
     )
 
 
-def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate, verdict_of):
+def test_lidar_limit_advises_range_check(estimate, verdict_of):
     cov = np.diag([0.015**2 / 3] * 3 + [1e-8] * 3)
     by_scatter = replace(estimate, cov=cov)
     figures = replace(estimate.diagnostics, sigma_systematic_translation_m=0.014)
@@ -127,7 +128,7 @@ def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(
     assert verdict_of(by_lidar)[1][0].action == "measure_ranges"
 
 
-def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimate, verdict_of):
+def test_far_from_nominal_fails(estimate, verdict_of):
     moved = perturb(estimate.T_cam_lidar, np.array([0.3, 0, 0, 0, 0, np.radians(20)]))
     cad = [pose.model_copy(update={"source": "cad"}) for pose in RIG.nominal_extrinsics]
     drawn = RIG.model_copy(update={"nominal_extrinsics": cad})
@@ -200,7 +201,7 @@ def test_a_plate_refused_for_its_size_counts_as_measured():
     assert plate_findings(refused[:2], BOARD) == []
 
 
-def test_a_plate_far_too_large_in_the_profile_has_an_edge_without_ring_ends(estimate):
+def test_plate_too_large_has_an_empty_edge(estimate):
     def enlarged(seen, n_dropped):
         sizes = {"width_m": BOARD.width_m, "width_sigma_m": 0.1}
         sizes |= {"height_m": BOARD.height_m, "height_sigma_m": 0.01}
@@ -217,7 +218,7 @@ def test_a_plate_far_too_large_in_the_profile_has_an_edge_without_ring_ends(esti
 @pytest.mark.parametrize(
     ("factor", "codes"), [(1.01, []), (8 / 7, ["verdict.scale"]), (0.7, ["verdict.scale"])]
 )
-def test_wrong_squares_or_another_lens_are_named_before_any_estimate(factor, codes):
+def test_distances_name_squares_or_lens(factor, codes):
     rng = np.random.default_rng(0)
     boards = rng.uniform([-1, -1, 1], [1, 1, 5], (8, 3))
     in_lidar = boards @ T_FORWARD[:3, :3] + rng.normal(0, 0.005, boards.shape)
@@ -328,7 +329,7 @@ def test_judge_intrinsics_that_fit_few_images_come_first(estimate, n_misfits, fi
     assert (verdict, findings[0].code) == ("fail", first)
 
 
-def test_squares_of_the_wrong_size_are_told_from_the_distances():
+def test_wrong_square_size_is_measured():
     """The camera believes in 70 mm squares where they measure 73.5 mm: it sees the boards 5 % too near."""
     captures = []
     for item in simulate(20, seed=2):
@@ -343,7 +344,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
     assert scale.figure("square_m") == pytest.approx(0.0735, abs=5e-4)
 
 
-def test_squares_that_are_wrong_come_before_a_lens_that_is_rough():
+def test_wrong_squares_come_before_the_lens():
     other = replace(CAMERA, fx_px=1.04 * CAMERA.fx_px, fy_px=1.04 * CAMERA.fy_px)
     profile = RIG.board.model_copy(update={"square_m": 0.93 * BOARD.square_m})
     known = replace(KNOWN, lens=LensPrior(other, 0.004, 3.6, 2.2))
@@ -358,7 +359,7 @@ def test_squares_that_are_wrong_come_before_a_lens_that_is_rough():
 
 
 @pytest.mark.parametrize(("focal", "severity"), [(1.01, "note"), (1.04, "warning")])
-def test_a_lens_that_the_profile_has_wrong_is_corrected_and_named(focal, severity):
+def test_wrong_lens_is_corrected_and_named(focal, severity):
     other = replace(CAMERA, fx_px=focal * CAMERA.fx_px, fy_px=focal * CAMERA.fy_px)
     known = replace(KNOWN, lens=LensPrior(other, 0.004, 3.6, 2.2))
     settings = EstimateSettings("ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005, tolerances=known)

@@ -41,7 +41,8 @@ def estimate(views):
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=[model_of(lens).name for lens in LENSES])
-def test_a_model_projects_as_the_camera_does_and_knows_its_derivatives(lens):
+def test_model_derivatives_match_differences(lens):
+    """The model projects as the camera does."""
     model, rng = model_of(lens), np.random.default_rng(0)
     vector = model.vector(lens)
     assert model.intrinsics(vector, lens.width_px, lens.height_px) == lens
@@ -57,7 +58,8 @@ def test_a_model_projects_as_the_camera_does_and_knows_its_derivatives(lens):
         assert np.allclose(columns, np.stack(numeric, axis=-1), atol=1e-5)
 
 
-def test_a_lens_moves_to_a_larger_model_unchanged_and_to_another_nearly():
+def test_convert_larger_lens_model_is_equal():
+    """Another family: within 0.6 px."""
     points = np.random.default_rng(0).uniform([-0.3, -0.3, 1], [0.3, 0.3, 2], (50, 3))
     pixels, _ = WIDE.project(points)
     for name, limit_px in (("radtan5", 1e-9), ("rational", 1e-9), ("equidistant", 0.6)):
@@ -101,7 +103,7 @@ def test_stated_deviations_are_true(hidden):
     assert 0.6 < np.mean(shapes**2) < 1.5
 
 
-def test_a_board_that_bends_anew_each_time_inflates_the_deviations():
+def test_bending_board_inflates_deviations():
     nees = {}
     for flutter_m in (0.0, 0.003):
         scene = Scene(sigma_px=0.02, flutter_m=flutter_m)
@@ -193,7 +195,8 @@ def test_captures_left_out_show_which_model_is_right():
     assert right < 0.1 < wrong
 
 
-def test_a_lens_differs_nothing_from_itself_and_a_moved_centre_is_mostly_a_turn(estimate):
+def test_compare_lenses_centre_is_a_turn(estimate):
+    """A lens does not differ from itself."""
     corners, cov = estimate.corners_px, estimate.cov
     same = compare_lenses(WIDE, WIDE, corners, cov, RADTAN5)
     assert same.rms_px < 1e-6
@@ -206,7 +209,8 @@ def test_a_lens_differs_nothing_from_itself_and_a_moved_centre_is_mostly_a_turn(
     assert longer.rms_px > 1.5
 
 
-def test_a_lens_is_known_where_boards_were_seen_and_the_weak_places_are_named():
+def test_certainty_ends_where_boards_end():
+    """The weak corners are named."""
     middle = estimate_intrinsics(
         photograph(12, 5, Scene(spread=(0.42, 0.58), distance_m=(2.0, 3.0))), BOARD, WIDE, RADTAN5
     )
@@ -257,14 +261,14 @@ def test_stale_intrinsics_fail_with_their_figures(views, kind):
         assert found.figures["is_turned"] and found.figures["turn_deg"] == check.turn_deg
 
 
-def test_a_lens_that_draws_nothing_where_boards_are_seen_fails(views):
+def test_lens_that_projects_nothing_fails(views):
     folded = replace(WIDE, distortion=(-60.0, 0.0, 0.0, 0.0))
     check = check_intrinsics(views, folded, BOARD)
     assert check.verdict() == "fail"
     assert not np.isfinite(lens_findings(check)[0].figure("displacement_px"))
 
 
-def test_a_lens_is_replaced_only_where_the_boards_determine_it_to_the_border(views):
+def test_judge_lens_central_boards_keep_it(views):
     stale = STALE["two per cent longer"]
     thorough = check_intrinsics(views, stale, BOARD)
     judgement = judge_lens(thorough.covered, thorough.image_sigma_px, thorough)
@@ -280,7 +284,8 @@ def test_a_lens_is_replaced_only_where_the_boards_determine_it_to_the_border(vie
     assert lens_findings(middle)[0].action == "collect"
 
 
-def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views):
+def test_lens_slight_difference_is_marginal(views):
+    """A lower target makes it fail."""
     slight = replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px)
     check = check_intrinsics(views, slight, BOARD)
     assert check.verdict() == "marginal"
@@ -289,7 +294,7 @@ def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views)
     assert check.verdict(target_deg=1.0) == "pass"
 
 
-def test_a_displacement_of_pixels_within_its_noise_is_not_stated_as_one(views):
+def test_displacement_in_noise_is_omitted(views):
     check = check_intrinsics(views, replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px), BOARD)
     assert lens_findings(check)[0].figures["is_displaced"]
     within = replace(check, displacement_px=0.3, displacement_sigma_px=0.5, turn_deg=0.0)
@@ -303,7 +308,7 @@ def test_a_displacement_of_pixels_within_its_noise_is_not_stated_as_one(views):
 @pytest.mark.parametrize(
     ("recording", "profile"), [("rlfs01", "rlfs"), ("sss_noise15mm", "sss"), ("rles01_lf", "rles")]
 )
-def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(recordings, recording, profile):
+def test_published_lenses_pass_stale_fail(recordings, recording, profile):
     rig = load_rig(profile)
     (camera,) = rig.cameras.values()
     lens, board = camera.to_intrinsics(), rig.board.to_board()

@@ -15,5 +15,5 @@ def test_absent_channels_events_without_captures_are_named(rles):
     assert absent_channels(rles, detections, ["frames"]) == []
 
 
-def test_absent_channels_camera_without_captures_is_no_channel(rles):
+def test_absent_channels_unused_is_none(rles):
     assert absent_channels(rles, Detections({}, {"lidar": SEEN}), None) == []

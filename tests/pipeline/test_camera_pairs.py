@@ -81,7 +81,7 @@ def test_camera_without_lidar_hangs_on_the_rig():
     assert np.degrees(np.linalg.norm(off[3:])) < 0.3 and np.linalg.norm(off[:3]) < 0.03
 
 
-def test_rig_in_two_parts_names_the_placement_that_joins_them():
+def test_rig_in_two_parts_asks_for_placement():
     found = simulate(40, 0)
     front = {n: b for n, b in found.lidars["front"].items() if n in found.images["left", "frames"]}
     rear = {

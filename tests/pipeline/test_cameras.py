@@ -55,7 +55,7 @@ def by_paper(session):
     return calibrated(detections(session), PAPER)
 
 
-def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
+def test_shared_boards_join_the_estimates(together):
     for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
         own = together[name]
         assert own.verdict == "pass"
@@ -66,7 +66,7 @@ def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
         assert own.estimated_with == (other,)
 
 
-def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
+def test_other_camera_is_given_on_both_sides(together):
     (to_left,), (to_right,) = (together[name].other_cameras for name in (RIGHT, LEFT))
     assert (to_left.camera, to_left.n_captures) == (LEFT, 12)
     assert (to_right.camera, to_right.n_captures) == (RIGHT, 12)
@@ -84,7 +84,7 @@ def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
     assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
 
 
-def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, by_paper):
+def test_other_methods_only_compare_cameras(session, by_paper):
     for name in (LEFT, RIGHT):
         alone = detections({name: session[name]})
         (own,) = calibrated(alone, PAPER, only(name)).values()

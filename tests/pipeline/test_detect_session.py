@@ -40,7 +40,7 @@ def test_detect_whole_scan_names_no_skipped_points(rig, tmp_path):
     assert refusal_of_room(rig, tmp_path / "s", every=1).code != "lidar.rings_skipped"
 
 
-def test_unlike_models_found_boards_do_not_hide_skipped_points(rig, tmp_path):
+def test_unlike_models_boards_hide_nothing(rig, tmp_path):
     with Session.create(tmp_path / "s", rig) as session:
         name = session.add_capture([], [room(rig, every=4)], {})
         # As if the board had been found in it.

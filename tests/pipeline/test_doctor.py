@@ -71,7 +71,7 @@ def test_its_clocks_are_compared(everything):
     assert lines["rig", "sync"].severity in ("note", "warning")
 
 
-def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path):
+def test_absent_camera_keeps_other_checks(tmp_path):
     rig = make_rig()
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
     attached = Attached(rig, None, SCAN, unlocked)

@@ -64,7 +64,7 @@ def seen(tmp_path_factory, stream):
     return session
 
 
-def test_the_board_is_found_and_followed_at_the_middle_of_the_sweep(seen):
+def test_event_board_is_found_at_mid_scan(seen):
     board = found_in(seen)
     assert board.stamp_ns == SCAN_NS + 50 * MS
     assert len(board.track_ns) == 4
@@ -83,7 +83,7 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
     assert [file.stat().st_mtime_ns for file in files] == changed
 
 
-def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
+def test_event_time_applies_clock_offsets(tmp_path, stream):
     profile = PROFILE.replace("first_firing, expected_offset_s: 0.0", "first_firing, expected_offset_s: 0.02")
     profile = profile.replace("mid_exposure, expected_offset_s: 0.0", "mid_exposure, expected_offset_s: 3.5")
     early = replace(stream, t_ns=stream.t_ns - 3_480 * MS)
@@ -91,7 +91,7 @@ def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
     assert board.stamp_ns == SCAN_NS + 50 * MS + 20 * MS - 3_500 * MS
 
 
-def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
+def test_event_time_is_median_of_first_board(seen):
     rig = load_rig("rles")
     lidar = replace(simulate(1, 0)[0].lidar, stamp_ns=SCAN_NS)
     offset_ns = 31 * MS + np.arange(len(lidar.points))
@@ -107,7 +107,7 @@ def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
     assert stamp({}) is None
 
 
-def test_another_scan_under_the_same_name_gives_another_picture(tmp_path, stream):
+def test_other_scan_makes_another_image(tmp_path, stream):
     first = found_in(session_of(tmp_path / "a", stream))
     other = session_of(tmp_path / "b", stream, stamp_ns=SCAN_NS - 40 * MS)
     # The cache travels along: the samples are the same, only the stamp is not.

@@ -129,7 +129,7 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     assert one["views_used"] == [f"{k:06d}.frames" for k in range(8)]
 
 
-def test_files_of_one_run_stand_together_and_those_of_others_stay(pictures, measured, tmp_path):
+def test_intrinsics_keep_files_of_others(pictures, measured, tmp_path):
     session = session_of(tmp_path / "session", pictures[:1])
     folder = session.path / "intrinsics"
     folder.mkdir()
@@ -144,7 +144,8 @@ def test_files_of_one_run_stand_together_and_those_of_others_stay(pictures, meas
     assert {path.name for path in folder.iterdir()} == kept
 
 
-def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
+def test_new_profile_keeps_comments(session, measured, tmp_path):
+    """An existing file is not replaced."""
     save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
     rig = load_rig(tmp_path / "new.yaml")
     assert rig.cameras["davis"].to_intrinsics() == measured.intrinsics
@@ -154,7 +155,7 @@ def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(s
         save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
 
 
-def test_intrinsics_that_are_determined_no_better_are_not_written(session, measured, tmp_path):
+def test_undetermined_intrinsics_are_refused(session, measured, tmp_path):
     assert measured.judgement.code == "intrinsics.fit"
     unknown = replace(measured, judgement=judge_lens(0.08, 65.0, None))
     assert unknown.judgement.code == "intrinsics.undetermined"

@@ -35,7 +35,7 @@ def seen(moved_m, offset_m=0.0, bias_sigma_m=0.008):
 
 
 @pytest.mark.long
-def test_boards_that_moved_between_image_and_scan_are_refused_with_an_action(tmp_path):
+def test_boards_moved_in_capture_are_refused(tmp_path):
     session = lce.Session.create(tmp_path / "session", lce.load_rig("rlfs"))
     errors = measure_lidar([session], found=[seen(0.0)])
     assert errors.n_captures == (16,) and errors.offset_m is None

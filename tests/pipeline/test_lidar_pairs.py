@@ -73,7 +73,7 @@ def codes(result):
     return {finding.code for finding in result.findings if finding.severity != "note"}
 
 
-def test_the_pose_is_found_within_its_uncertainty_and_passes():
+def test_lidar_pairs_pose_fits_covariance():
     rig, chi2 = make_rig(), []
     for seed in range(4):
         result = calibrate(rig, scan_both(20, seed, rig.board.to_board()))
@@ -87,7 +87,7 @@ def test_the_pose_is_found_within_its_uncertainty_and_passes():
 
 
 @pytest.mark.parametrize("sides", [(0.7, 0.7), (0.9, 0.7)])
-def test_a_plate_that_looks_the_same_when_turned_is_no_doubt(sides):
+def test_lidar_pairs_symmetric_plate_is_fine(sides):
     rig = make_rig({"type": "plain", "width_m": sides[0], "height_m": sides[1]})
     scans = scan_both(14, 3, rig.board.to_board())
     n_fold = 4 if sides[0] == sides[1] else 2
@@ -120,7 +120,7 @@ def test_a_lidar_that_moved_between_captures_never_passes(n_moved, turn_deg):
         assert "verdict.moved" in codes(result)
 
 
-def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
+def test_lidar_pairs_cut_boards_are_refused():
     rig = make_rig()
     scans = dict(scan_both(9, 1, rig.board.to_board()))
     cut = LIDAR_OTHER_SIZE.refusal(
@@ -136,7 +136,8 @@ def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
     assert caught.value.finding.code == "shortage.few_detected"
 
 
-def test_another_plate_in_the_first_lidars_scan_does_not_move_the_result():
+def test_lidar_pairs_other_plate_is_refused():
+    """The result is that of the other captures."""
     rig = make_rig()
     board = rig.board.to_board()
     scans, rng = scan_both(16, 5, board), np.random.default_rng(0)
@@ -184,7 +185,8 @@ def test_loop_findings_open_loop_is_named():
     assert finding.severity != "note"
 
 
-def test_profiles_of_plain_plates_read_back_and_have_no_camera():
+def test_plain_plate_profiles_have_no_camera():
+    """The profile survives writing and reading."""
     rig = make_rig()
     assert parse_rig(dump_rig(rig)) == rig
     camera = """

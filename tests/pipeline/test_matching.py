@@ -20,7 +20,7 @@ def session(recordings, tmp_path_factory):
 
 @pytest.mark.dataset
 @pytest.mark.long
-def test_boards_that_walls_hide_are_found_where_their_image_has_them(session):
+def test_hidden_boards_are_found_by_images(session):
     detections = detect(session)
     pair = Pair("cam", "frames", "lidar")
     assert len(detections.captures(pair)) == 11
@@ -31,7 +31,7 @@ def test_boards_that_walls_hide_are_found_where_their_image_has_them(session):
 
 @pytest.mark.dataset
 @pytest.mark.long
-def test_nothing_is_predicted_from_few_captures_or_without_an_image(session):
+def test_predict_needs_captures_and_image(session):
     found = detect(session)
     names = found.captures(Pair("cam", "frames", "lidar"))
     refusal = Refusal("lidar.no_returns", figures={"n_points": 0, "min_range_m": 0.4})

@@ -87,7 +87,7 @@ def write_cloud(path, elevations_deg, columns):
     path.write_text(head + "\n".join(f"{x:.5f} {y:.5f} {z:.5f} {int(k)}" for x, y, z, k in rows))
 
 
-def test_the_beams_of_an_unknown_model_are_measured_in_a_recording(tmp_path):
+def test_new_profile_measures_unknown_beams(tmp_path):
     elevations_deg = np.sort(np.r_[np.linspace(-20, -6, 8), np.linspace(-5, 5, 16), [8, 14]])
     write_cloud(tmp_path / "pcd" / "0.pcd", elevations_deg, 900)
     lens = parse_intrinsics("radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0")

@@ -15,7 +15,8 @@ RIG = load_rig("rlfs")
 OTHER = changed(RIG, cameras__cam__intrinsics__cx_px=660.0)
 
 
-def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts():
+def test_other_profile_names_differing_keys():
+    """The intrinsics are those of the result."""
     rig, (note,) = with_lenses_of(changed(OTHER, board__square_m=0.071), RIG)
     assert note.code == "verify.other_profile"
     assert str(note.figures["keys"]).split(", ") == ["board.square_m", "cameras.cam.intrinsics.cx_px"]
@@ -29,7 +30,8 @@ def test_the_same_profile_or_none_changes_nothing():
     assert with_lenses_of(RIG, None) == (RIG, ())
 
 
-def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_path):
+def test_profile_behind_result_is_unchanged(tmp_path):
+    """A changed profile is searched among the earlier ones."""
     profile, file = tmp_path / "rig.yaml", tmp_path / "calibration/front/result.json"
     file.parent.mkdir(parents=True)
     profile.write_text(dump_rig(RIG))

@@ -42,7 +42,7 @@ def pose_in(folder):
     return read_result(folder / "result.json").pairs[0].T_cam_lidar
 
 
-def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, folder):
+def test_write_keeps_previous_with_exports(session, folder):
     first = write(session, GOOD)
     assert first.previous is None
     (folder / "overlays").mkdir()
@@ -59,7 +59,7 @@ def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, f
     assert "previous" not in names(folder / "previous")
 
 
-def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder):
+def test_write_failures_keep_last_usable(session, folder):
     write(session, GOOD)
     for k in range(3):
         failed = calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=())
@@ -72,7 +72,7 @@ def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
-def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_path):
+def test_write_one_camera_keeps_the_other(tmp_path):
     rig = load_rig("rles")
     cameras = {
         name: changed(rig.cameras["davis"], frame=name, optical_frame=f"{name}_optical")
@@ -92,14 +92,14 @@ def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_pa
     assert [c.camera for c in read_result(folder / "previous" / "result.json").pairs] == ["left"]
 
 
-def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
+def test_write_keeps_last_failed_if_no_other(session, folder):
     write(session, FAILED)
     written = write(session, calibration(verdict="fail", captures_used=()), force=True)
     assert written.previous is not None and not written.has_usable_previous
     assert read_result(folder / "previous" / "result.json").pairs[0].findings == (reason("too few"),)
 
 
-def test_the_same_result_again_keeps_overlays_and_the_previous_one(session, folder):
+def test_write_same_result_keeps_previous(session, folder):
     write(session, GOOD)
     write(session, OTHER)
     (folder / "overlays").mkdir()
@@ -109,7 +109,7 @@ def test_the_same_result_again_keeps_overlays_and_the_previous_one(session, fold
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
-def test_what_the_user_put_beside_a_result_and_the_one_before_stays(session, folder):
+def test_write_keeps_user_files(session, folder):
     (folder / "previous").mkdir(parents=True)
     (folder / "photos").mkdir()
     notes = [folder / "photos" / "rig.txt", folder / "previous" / "notes.txt"]
@@ -133,7 +133,7 @@ def test_a_file_in_place_of_a_folder_is_refused_and_stays(session, folder, name)
     assert not list(session.path.glob(".new-*"))
 
 
-def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder):
+def test_write_failed_keeps_earlier_result(session, folder):
     write(session, GOOD)
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ResultRefusedError):
@@ -146,7 +146,7 @@ def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder)
     assert not list(session.path.glob(".new-*"))
 
 
-def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folder):
+def test_write_folder_as_result_is_kept(session, folder):
     (folder / "result.json").mkdir(parents=True)
     (folder / "result.json" / "note").write_text("mine")
     assert result_content(folder) is None

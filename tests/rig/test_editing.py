@@ -11,7 +11,7 @@ from lce_rig.rig import derive_text, find_profile, load_rig, parse_rig, set_valu
 RLES = find_profile("rles").read_text(encoding="utf-8")
 
 
-def test_another_focus_changes_five_lines_and_keeps_every_comment():
+def test_derive_new_focus_keeps_comments():
     numbers = {"fx_px": "305.5716", "fy_px": "305.6182", "cx_px": "175.2111", "cy_px": "125.4881"}
     settings = [(f"cameras.davis.intrinsics.{key}", value) for key, value in numbers.items()]
     text = derive_text(RLES, "rles02", settings, "rles02.yaml", "rles")
@@ -41,7 +41,7 @@ def test_entries_of_lists_are_reached_by_their_place():
     assert rig.nominal_extrinsics[0].translation_m == (1, 2, 3)
 
 
-def test_a_profile_that_would_be_wrong_is_refused_with_its_key():
+def test_derive_wrong_profile_names_the_key():
     with pytest.raises(ProfileError, match=r"new\.yaml"):
         derive_text(RLES, "new", [("board.square_m", "68")], "new.yaml", "rles")
     with pytest.raises(ProfileError, match=r"board\.sqare_m"):

@@ -49,7 +49,7 @@ def test_shipped_profiles_carry_the_published_numbers():
     assert sss.nominal("cam", "lidar") is None
 
 
-def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera():
+def test_nominal_pose_forward_is_camera_axis():
     entry = load_rig("rles").nominal("davis", "lidar")
     np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
@@ -105,7 +105,7 @@ def test_each_mistake_is_named_with_its_line_and_key(old, new, key):
         ),
     ],
 )
-def test_a_mistake_is_answered_with_the_figure_or_key_that_is_meant(edits, facts):
+def test_mistake_names_figure_or_key(edits, facts):
     text = refusal(*edits)
     assert all(fact in text for fact in facts)
 
@@ -138,7 +138,7 @@ def rows(R):
 
 @settings(max_examples=10)
 @given(st.tuples(*[st.floats(-3, 3)] * 3))
-def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi):
+def test_nominal_rotation_notations_agree(phi):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_rotvec(phi)
@@ -186,7 +186,7 @@ def test_documented_defaults_are_those_of_the_code():
                 assert float(documented[key]) == field.default, key
 
 
-def test_a_driver_or_model_that_nothing_knows_is_named_with_its_key():
+def test_unknown_driver_or_model_is_named():
     (unknown,) = parse_rig(RLFS.replace("model: VLP-16", "model: XY-64")).warnings()
     assert (unknown.code, unknown.subject) == ("profile.unknown_model", "lidars.lidar.model")
     assert "cameras.cam.driver.type" in refusal(("type: v4l2", "type: webcam"))
@@ -214,7 +214,7 @@ sync:
         ("device:", "type: nmea\n  device:", "sync.type"),
     ],
 )
-def test_a_sync_board_that_cannot_be_meant_is_refused_with_its_key(old, new, key):
+def test_invalid_sync_board_names_its_key(old, new, key):
     with pytest.raises(ProfileError) as caught:
         parse_rig(RLFS + SYNC.replace(old, new))
     assert f"{key}: " in str(caught.value)
@@ -257,7 +257,7 @@ def test_keys_of_another_type_of_board_are_named(changes, key):
         ("tags", (2, 1), True),
     ],
 )
-def test_boards_with_too_few_corners_to_be_detected_are_refused(key, size, is_accepted):
+def test_boards_with_few_corners_are_refused(key, size, is_accepted):
     board = {
         "squares": {"type": "charuco", "marker_m": 0.05, "dictionary": "5X5_50"},
         "tags": {"type": "aprilgrid", "tag_spacing": 0.3},
@@ -272,7 +272,8 @@ def test_boards_with_too_few_corners_to_be_detected_are_refused(key, size, is_ac
     assert f"board.{key}" in caught.value.what + caught.value.hint
 
 
-def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerboards():
+def test_marked_board_profile_reads_back():
+    """Profiles without a type have a checkerboard."""
     document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
     assert load_rig("rlfs").board.type == "checkerboard"
     document["board"] = {
@@ -293,7 +294,7 @@ def test_keys_of_earlier_versions_are_read_and_mean_nothing():
 
 
 @pytest.mark.parametrize("key", ["verdict", "targets", "reconstruction", "azimuth_offset_sigma_deg"])
-def test_keys_of_earlier_versions_are_refused_where_they_never_stood(key):
+def test_misplaced_earlier_keys_are_refused(key):
     with pytest.raises(ProfileError, match=rf"board\.{key}"):
         parse_rig(set_value(RLFS, f"board.{key}", "1"))
 

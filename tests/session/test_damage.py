@@ -32,7 +32,7 @@ while True:
 
 
 @pytest.mark.long
-def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
+def test_killed_writer_leaves_whole_captures(tmp_path):
     path = tmp_path / "s"
     promised = set()
     for k in range(6):
@@ -58,7 +58,7 @@ def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
     assert not list((path / "captures").glob(".new-*"))
 
 
-def test_a_file_that_may_not_grow_is_named_and_loses_nothing(tmp_path, rig, samples):
+def test_add_capture_full_disk_loses_nothing(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})
     with files_up_to(2000), pytest.raises(SessionError):
@@ -102,7 +102,7 @@ def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path, rig, samples):
         session.capture("000007")
 
 
-def test_a_file_in_the_session_s_place_is_said_and_no_room_is_asked_for(tmp_path, rig):
+def test_file_as_session_is_not_a_full_disk(tmp_path, rig):
     (tmp_path / "s").write_text("a note")
     for path in (tmp_path / "s", tmp_path / "s/below"):
         with pytest.raises(SessionError) as caught:

@@ -74,7 +74,7 @@ def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rles):
     }
 
 
-def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path, rles):
+def test_captures_without_events_keep_format(tmp_path, rles):
     captures = make_session(tmp_path / "s", rles).captures
     manifests = [json.loads((capture.path / "meta.json").read_text()) for capture in captures]
     assert [manifest["format_version"] for manifest in manifests] == [2, 1]
@@ -84,7 +84,7 @@ def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_pat
     assert captures[1].content_sha256 == content_hash(*noise_samples(1))
 
 
-def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path, rles):
+def test_captures_of_other_events_are_new(tmp_path, rles):
     session = make_session(tmp_path / "s", rles)
     images, scans = noise_samples(0)
     events = noise_events(0)

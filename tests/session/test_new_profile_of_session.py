@@ -33,7 +33,7 @@ def test_the_new_profile_counts_and_every_earlier_one_stays(rig, tmp_path):
 
 
 @pytest.mark.parametrize("changes", [{"name": "other"}, {"lidars__lidar__serial": "B"}, {"cameras": "front"}])
-def test_the_profile_of_another_rig_is_refused_and_nothing_changes(rig, tmp_path, changes):
+def test_new_profile_other_rig_is_refused(rig, tmp_path, changes):
     if changes == {"cameras": "front"}:
         changes = {"cameras": {"front": rig.cameras["cam"]}, "nominal_extrinsics": ()}
     Session.create(tmp_path / "s", changed(rig, lidars__lidar__serial="A")).close()
@@ -44,7 +44,7 @@ def test_the_profile_of_another_rig_is_refused_and_nothing_changes(rig, tmp_path
     assert contents(tmp_path / "s") == before
 
 
-def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_path):
+def test_kept_text_ends_with_another_profile(tmp_path):
     path, rig = tmp_path / "s", load_rig("rlfs")
     text = "# mine\n" + read_profile(Path(__file__).parents[2] / "rigs" / "rlfs.yaml")
     with Session.create(path, rig.of_robot("kestrel")) as session:
@@ -57,7 +57,7 @@ def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_pa
         assert session.profile_text() == dump_rig(session.rig)
 
 
-def test_a_session_that_stayed_empty_is_removed_with_its_comments(rig, tmp_path):
+def test_discard_empty_removes_kept_text(rig, tmp_path):
     with Session.create(tmp_path / "s", rig) as session:
         session.keep_text(dump_rig(rig))
     assert discard_if_empty(tmp_path / "s")

@@ -30,7 +30,7 @@ def fill(rig, samples):
     return make
 
 
-def test_what_captures_tell_and_what_the_profile_states_come_together(fill, rig, tmp_path):
+def test_provenance_joins_captures_and_rig(fill, rig, tmp_path):
     named = changed(rig.of_robot("kestrel"), cameras__cam__serial="C7")
     found = provenance_of(fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"}))
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
@@ -71,7 +71,7 @@ def test_the_fingerprint_changes_with_inputs_only(fill, rig, samples, tmp_path):
     assert content_sha256(Session.open(tmp_path / "f")) not in hashes
 
 
-def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(rig, samples, tmp_path):
+def test_provenance_without_times_has_import(rig, samples, tmp_path):
     with Session.create(tmp_path / "a", rig) as session:
         images, scans = samples(1)
         # A clock that counts from the sensor's start tells no date.

@@ -20,7 +20,7 @@ def names(captures):
     return [capture.name for capture in captures]
 
 
-def test_a_rejected_capture_is_out_of_use_and_comes_back_to_the_byte(session):
+def test_rejected_capture_restores_unchanged(session):
     before = {file.name: file.read_bytes() for file in session.capture("000001").path.iterdir()}
     session.reject("000001", "glare")
     assert (names(session.captures), names(session.rejected)) == (["000000", "000002"], ["000001"])
@@ -35,7 +35,7 @@ def test_a_rejected_capture_is_out_of_use_and_comes_back_to_the_byte(session):
     assert session.read_journal()[-2]["reason"] == "glare"
 
 
-def test_neither_the_name_nor_the_data_of_a_rejected_capture_is_taken_anew(session, samples):
+def test_rejected_name_and_data_stay_taken(session, samples):
     session.reject("000002")
     assert session.find_duplicate(*samples(2)) == "000002"
     assert session.add_capture(*samples(7), {}) == "000003"
@@ -46,7 +46,7 @@ def test_neither_the_name_nor_the_data_of_a_rejected_capture_is_taken_anew(sessi
         assert names(again.captures) == ["000000", "000001", "000002", "000003"]
 
 
-def test_another_sessions_captures_come_in_once_and_as_they_were(session, tmp_path, rig, samples):
+def test_add_session_copies_captures_once(session, tmp_path, rig, samples):
     with Session.create(tmp_path / "friday", rig) as friday:
         for seed in (2, 7, 8):
             friday.add_capture(*samples(seed), {"source": {"key": f"f:{seed}"}})

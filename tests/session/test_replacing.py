@@ -49,7 +49,8 @@ def test_an_error_leaves_the_earlier_folder(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_the_session_itself_may_be_a_link_but_not_what_is_replaced(tmp_path):
+def test_replace_in_linked_session_only(tmp_path):
+    """A link in the place of what is replaced is refused."""
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     for text in ("one", "two"):

@@ -36,7 +36,7 @@ def test_times_of_any_size_survive(tmp_path, rig, offsets):
     assert session.captures[0].scan("lidar").offset_ns.tolist() == offsets
 
 
-def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig, samples):
+def test_other_rig_names_differing_keys(tmp_path, rig, samples):
     with Session.create(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
     text = dump_rig(rig).replace("square_m: 0.07", "square_m: 0.06")
@@ -54,7 +54,7 @@ def test_a_session_without_captures_takes_another_profile(tmp_path, rig):
     assert Session.open(tmp_path / "s").rig == load_rig("rles")
 
 
-def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, samples):
+def test_resume_other_driver_is_accepted(tmp_path, rig, samples):
     with Session.resume(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
     moved = changed(rig, cameras__cam__driver__device="/dev/video7")
@@ -63,7 +63,7 @@ def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, sam
     assert Session.open(tmp_path / "s").rig.cameras["cam"].driver.device == "/dev/video7"
 
 
-def test_a_session_that_holds_nothing_can_be_discarded_and_no_other(tmp_path, rig, samples):
+def test_discard_only_an_empty_session(tmp_path, rig, samples):
     for name in ("empty", "captured", "noted"):
         with Session.create(tmp_path / name, rig) as session:
             if name == "captured":
@@ -95,7 +95,7 @@ def test_folders_that_are_no_session_are_left_alone(tmp_path, rig):
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_session_whose_creation_was_cut_off_is_created_anew(tmp_path, rig):
+def test_resume_cut_creation_starts_again(tmp_path, rig):
     Session.create(tmp_path / "s", rig).close()
     (tmp_path / "s" / "session.json").unlink()
     Session.resume(tmp_path / "s", rig).close()
@@ -154,7 +154,7 @@ def test_the_journal_is_appended_and_a_torn_line_is_skipped(tmp_path, rig):
     assert session.read_journal()[-1]["captured"] == 3
 
 
-def test_cached_arrays_come_back_and_damage_counts_as_nothing(tmp_path):
+def test_load_arrays_damage_is_never_wrong(tmp_path):
     file = tmp_path / "detections" / "abc" / "000000.npz"
     arrays = {"b": np.arange(6).reshape(2, 3), "a": np.array([1.5])}
     assert store_arrays(file, arrays)

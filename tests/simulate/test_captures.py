@@ -38,7 +38,7 @@ def n_rings_on_board(rig, lidar, capture):
     return int(np.sum(np.bincount(scan.ring[inside], minlength=16) >= 5))
 
 
-def test_truth_differs_from_the_nominal_within_its_tolerance(rig):
+def test_truth_is_within_nominal_tolerance(rig):
     entry = rig.nominal_extrinsics[0]
     nominal = entry.to_matrix()
     truths = [truth_extrinsics(rig, seed)["cam", "lidar"] for seed in range(20)]
@@ -56,7 +56,8 @@ def test_the_papers_simulated_rig_has_exactly_its_extrinsic():
     )
 
 
-def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(rig, captures):
+def test_boards_are_visible_and_spread(rig, captures):
+    """Tilted, too, and on enough rings."""
     lens = rig.cameras["cam"].to_intrinsics()
     for capture in captures:
         assert lens.is_inside(corners_px(rig, "cam", capture), 2.0).all()
@@ -70,7 +71,7 @@ def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(rig, captur
     assert angles.max() > 25
 
 
-def test_the_same_seed_gives_the_same_bytes_however_many_captures(rig, captures):
+def test_same_seed_gives_the_same_bytes(rig, captures):
     again = list(simulate_captures(rig, n_captures=1, seed=11))
     for one, other in zip(captures, again, strict=False):
         assert one.images[0].pixels.tobytes() == other.images[0].pixels.tobytes()
@@ -100,7 +101,7 @@ def test_cameras_mounted_anyhow_see_the_board(mount):
         assert n_rings_on_board(rig, "lidar", capture) >= 4
 
 
-def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for():
+def test_two_cameras_take_turns_as_target():
     one = make_rig()
     cameras = {
         "left": {**one.cameras["cam"].model_dump(), "frame": "left", "optical_frame": "left_optical"},
@@ -124,7 +125,7 @@ def test_a_lidar_nobody_can_simulate_is_named(rig):
     assert "OS1-64" in caught.value.hint
 
 
-def test_a_rig_whose_lidar_cannot_see_what_the_camera_sees_is_refused():
+def test_lidar_without_view_is_refused():
     ceiling = nominal("cam", matrix=((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     with pytest.raises(LceRigError):
         next(simulate_captures(make_rig(nominal_extrinsics=(ceiling,)), n_captures=1, seed=0))

@@ -64,7 +64,7 @@ def intervals_ns(events):
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
-def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(sigma):
+def test_quiet_pixels_follow_the_intensity(sigma):
     noise = replace(QUIET_EVENTS, threshold_sigma=sigma)
     pixels, scene = draw_pixels(LENS, noise, np.random.default_rng(4)), ripples()
     for duration_s in (0.1, 0.37, 0.5):
@@ -75,7 +75,7 @@ def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(
         assert len(events) > 1000
 
 
-def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it():
+def test_ramp_gives_an_event_per_threshold():
     def ramp(t_s):
         left = np.arange(SHAPE[1]) < 32
         up = 0.1 * np.exp(4.01 * t_s * 0.30)
@@ -91,7 +91,7 @@ def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it():
     assert np.allclose(1e-9 * (first.t_ns - START_NS), expected_s, atol=1e-4)
 
 
-def test_events_come_in_order_of_whole_microseconds_across_packets():
+def test_events_are_ordered_microseconds():
     packets = record(EventNoise(), ripples(), n_packets=10)
     t_ns = np.concatenate([packet.t_ns for packet in packets])
     assert np.all(np.diff(t_ns) >= 0)
@@ -138,7 +138,8 @@ def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark():
     assert events.polarity.mean() == pytest.approx(0.5, abs=0.02)
 
 
-def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event():
+def test_thresholds_spread_as_configured():
+    """From pixel to pixel, and from event to event."""
     noise = replace(QUIET_EVENTS, threshold_sigma=0.04)
     pixels = draw_pixels(LENS, noise, np.random.default_rng(0))
     assert pixels.threshold_on.mean() == pytest.approx(noise.threshold_on, abs=0.004)

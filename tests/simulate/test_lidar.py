@@ -78,7 +78,7 @@ def test_firings_follow_the_manuals_timing_table(exact):
     assert exact.offset_ns.min() >= 0 and exact.offset_ns.max() < 100_000_000
 
 
-def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact):
+def test_rings_match_the_beam_table(exact):
     expected = np.radians(np.arange(-15, 16, 2))
     for ring in range(16):
         points = exact.points[exact.ring == ring].astype(float)
@@ -87,7 +87,7 @@ def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact):
         assert np.abs(elevation - expected[ring]).max() < 1e-5
 
 
-def test_quantised_scans_step_by_two_millimetres_and_a_hundredth_of_a_degree(scene, T_world_lidar):
+def test_quantised_scans_step_as_the_sensor(scene, T_world_lidar):
     scan = scan_of(scene, T_world_lidar, replace(EXACT, is_quantised=True))
     points = scan.points.astype(float)
     points[:, 2] -= VLP16.vertical_offsets_m[lasers(scan)]
@@ -119,7 +119,7 @@ def test_mixed_pixels_occur_and_only_at_the_boards_border(board, T_world_lidar):
 @pytest.mark.parametrize(
     "noise, growth_mm", [(EXACT, 0.0), (BEAM, 7.5), (replace(BEAM, edge_growth_m=0.005), 11.5)]
 )
-def test_returns_reach_beyond_the_border_by_the_footprint_on_average(board, T_world_lidar, noise, growth_mm):
+def test_returns_reach_over_by_the_footprint(board, T_world_lidar, noise, growth_mm):
     # Footprint at 3 m: half of 10 mm + 3 m * 3 mrad = 9.5 mm; the outermost 4 % of its energy are too weak.
     scene = Scene(Raycaster(()), [], board, board_before_lidar(3.0, roll_deg=0.0))
     step_m = 3.0 * VLP16.step_rad
@@ -163,7 +163,7 @@ def test_dark_squares_and_weak_returns_read_long(board, T_world_lidar):
     assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
 
 
-def test_rim_noise_moves_points_near_the_border_and_no_others(board, T_world_lidar):
+def test_rim_noise_moves_border_points_only(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
     plain, rimmed = (scan_of(scene, T_world_lidar, replace(EXACT, rim_spread_rad=w)) for w in (0.0, 0.0015))
     moved_m = np.linalg.norm(plain.points - rimmed.points, axis=1)

@@ -34,7 +34,7 @@ def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps):
         assert rms_mps == pytest.approx(speed_mps, rel=0.02, abs=1e-6)
 
 
-def test_a_carried_board_rests_at_each_placement_and_never_jumps():
+def test_carried_board_rests_and_never_jumps():
     placements = [board_before_lidar(2.0), board_before_lidar(3.0, roll_deg=30.0, yaw_deg=25.0)]
     placements.append(
         pose(placements[0][:3, :3] @ exp_so3(np.array([0.3, -0.4, 0.1])), np.array([1.5, 0.7, 1.2]))
@@ -72,7 +72,7 @@ def heights_m(scan, T_world_lidar, T_world_board):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_lidar_meets_a_moving_board_where_it_is_at_each_firing(board, T_world_lidar, seed):
+def test_lidar_meets_a_board_at_each_firing(board, T_world_lidar, seed):
     trajectory = sway(HandMotion(speed_mps=(0.5, 0.5), turn_deg_s=40.0), seed)
     scan = moving_scan(board, T_world_lidar, trajectory, LidarNoise.none())
     assert scan.offset_ns is not None and scan.stamp_ns is not None and len(scan.points) > 500

@@ -132,7 +132,7 @@ def test_stamps_mark_the_middle_of_the_exposure(rig):
 
 
 @pytest.mark.long
-def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(rig, quiet):
+def test_stamps_include_their_channel_offset(rig, quiet):
     late = replace(BRIEF, frame_offset_s=0.12, event_offset_s=-0.015)
     capture = next(simulate_captures(rig, n_captures=1, seed=6, options=late))
     assert stamp_of(capture.images[0]) == stamp_of(quiet.images[0])

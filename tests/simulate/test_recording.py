@@ -37,7 +37,7 @@ def test_samples_come_in_order_at_each_sensors_own_rate(recording, samples):
     assert max(stamp_of(sample) for sample in samples) < recording.end_ns == recording.start_ns + 600_000_000
 
 
-def test_pictures_and_scans_show_the_board_where_the_truth_has_it(rig, recording, samples):
+def test_recording_shows_the_true_board(rig, recording, samples):
     lens, n_seen = rig.cameras["cam"].to_intrinsics(), 0
     for sample in samples:
         if isinstance(sample, Image):

@@ -49,7 +49,7 @@ def capture_of(trajectory, on_board):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.9])
-def test_the_lidars_time_is_the_mean_of_its_returns_from_the_board(rig, share):
+def test_board_time_is_the_mean_of_returns(rig, share):
     hand = HandMotion(speed_mps=(0.6, 0.6))
     swaying = sway_board(T_WORLD_BOARD, STAMP_NS, hand, np.random.default_rng(1))
     on_board = np.arange(500) < 500 * share
@@ -60,7 +60,7 @@ def test_the_lidars_time_is_the_mean_of_its_returns_from_the_board(rig, share):
         assert board_time_ns(rig, capture, scan) == pytest.approx(expected_ns, abs=1)
 
 
-def test_without_returns_or_times_it_is_the_middle_of_the_sweep(rig):
+def test_board_time_no_returns_is_middle(rig):
     capture = capture_of(hold_board(T_WORLD_BOARD), np.zeros(50, np.bool_))
     assert board_time_ns(rig, capture, capture.scans[0]) == STAMP_NS + 50_000_000
     capture = capture_of(hold_board(T_WORLD_BOARD), np.ones(50, np.bool_))
@@ -68,7 +68,7 @@ def test_without_returns_or_times_it_is_the_middle_of_the_sweep(rig):
     assert board_time_ns(rig, capture, timeless) == STAMP_NS + 50_000_000
 
 
-def test_each_sensors_pose_is_that_at_its_own_time_of_the_rigs_clock(rig):
+def test_truth_poses_are_at_sensor_times(rig):
     swaying = sway_board(T_WORLD_BOARD, STAMP_NS, HandMotion(speed_mps=(0.3, 0.3)), np.random.default_rng(2))
     capture = capture_of(swaying, np.ones(50, np.bool_))
     truth = capture_truth(rig, capture, SimulationOptions(motion="moving", frame_offset_s=0.12))

@@ -21,7 +21,7 @@ def of_model(model):
 
 
 @pytest.mark.parametrize("model", ["Mid-360", pytest.param("Avia", marks=pytest.mark.long)])
-def test_beams_fill_the_field_of_view_and_the_board_is_found_where_it_is(model):
+def test_beams_fill_the_view_and_find_board(model):
     rig = of_model(model)
     sheet = rig.lidars["lidar"].data_sheet()
     assert sheet is not None

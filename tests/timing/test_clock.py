@@ -56,7 +56,7 @@ def rms(values):
 
 
 @pytest.mark.parametrize("where_s", [0.0, 5.0, 10.0, 40.0])
-def test_the_time_from_requests_is_off_by_no_more_than_its_sigma_says(where_s):
+def test_clock_requests_error_fits_sigma(where_s):
     sigmas = []
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -69,7 +69,7 @@ def test_the_time_from_requests_is_off_by_no_more_than_its_sigma_says(where_s):
 
 
 @pytest.mark.parametrize("where_s", [0.0, 15.0, 29.5])
-def test_the_time_from_edges_is_off_by_as_much_as_its_sigma_says(where_s):
+def test_clock_edges_error_matches_sigma(where_s):
     sigmas = []
     for seed in range(300):
         device = Device(drift=-25e-6)
@@ -104,7 +104,7 @@ def test_too_few_readings_make_no_model():
     assert fit_clock(np.full(9, S), np.full(9, START_NS), "edges") is None
 
 
-def test_models_in_a_row_convert_like_one_after_the_other_and_add_their_errors():
+def test_clock_chained_models_add_errors():
     camera, board = Device(40e-6, 7 * S), Device(-90e-6, 2 * S)
     sigmas = []
     for seed in range(200):
@@ -119,7 +119,7 @@ def test_models_in_a_row_convert_like_one_after_the_other_and_add_their_errors()
     assert "80 edges" in through.origin and "60 edges" in through.origin
 
 
-def test_edges_find_their_partners_in_spite_of_losses_and_bounces():
+def test_match_edges_survives_losses_bounces():
     rng = np.random.default_rng(3)
     device = Device(40e-6)
     times = np.arange(200) * 0.05 * S
@@ -146,7 +146,7 @@ def followed(rng, jump_ns, at_s, what="host"):
 
 
 @pytest.mark.parametrize("jump_ns", [3 * S, -3 * S, 20_000_000, -2_000_000])
-def test_a_host_clock_that_is_set_is_noticed_once_and_followed(jump_ns):
+def test_clock_set_host_is_noticed_once(jump_ns):
     for seed in range(5):
         tracker, device, steps = followed(np.random.default_rng(seed), jump_ns, at_s=20)
         assert len(steps) == 1
@@ -156,7 +156,7 @@ def test_a_host_clock_that_is_set_is_noticed_once_and_followed(jump_ns):
         assert abs(error_ns) < 4 * tracker.model.sigma_ns(stamp_ns)
 
 
-def test_a_device_that_begins_anew_is_noticed_at_its_first_reading():
+def test_clock_device_restart_is_noticed():
     tracker, _, steps = followed(np.random.default_rng(0), 15 * S, at_s=15, what="device")
     assert [round(step.size_ns / S) for step in steps] == [15]
     assert tracker.model.first_ns >= steps[0].source_ns
@@ -170,5 +170,5 @@ def test_a_tracker_forgets_what_is_older_than_its_window():
 
 
 @given(st.integers(0, 3 * 10**18), st.integers(-HOUR_NS // 2 + 1, HOUR_NS // 2 - 1))
-def test_the_hour_comes_from_a_clock_that_is_right_within_half_an_hour(true_ns, error_ns):
+def test_resolve_hour_within_half_an_hour(true_ns, error_ns):
     assert resolve_hour(true_ns % HOUR_NS, true_ns + error_ns) == true_ns

@@ -62,7 +62,7 @@ def is_cut_exactly(frame, events, begin_ms):
 
 
 @given(edges=st.lists(st.integers(0, 4000), max_size=30).map(sorted))
-def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(rles, edges):
+def test_event_buffer_cuts_exactly(rles, edges):
     events = stream(0, 3000, 4000)
     begins_ms = (1300, 1400, 1700)
     pictures = [image(t + 50) for t in begins_ms]
@@ -73,7 +73,8 @@ def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(rles
     assert frames[0].events[0].events.host_ns is None
 
 
-def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rles):
+def test_event_buffer_reports_missing_time(rles):
+    """The stream begins late or ends early."""
     events = stream(900, 1800, 5000)
     samples = [*packets(events, range(100, 5000, 100)), *(scan(t) for t in (100, 1000, 1700, 3500))]
     frames = frames_of([*samples, *(image(t + 50) for t in (100, 1000, 1700, 3500))], rles)
@@ -115,7 +116,9 @@ def test_two_event_cameras_get_a_stretch_each(rles):
     ]
 
 
-def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rles):
+def test_event_buffer_memory_is_bounded(rles):
+    """Also while the LiDAR is silent."""
+
     def samples(n_packets):
         for k in range(n_packets):
             yield replace(packet, t_ns=packet.t_ns + k * 20 * MS)

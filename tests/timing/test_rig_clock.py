@@ -57,7 +57,7 @@ def scan(stamp_ns):
     return Scan("lidar", stamp_ns, np.zeros((0, 3), np.float32), nothing, nothing.astype(np.int16))
 
 
-def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still():
+def test_rig_clock_without_board_needs_still():
     clock = RigClock(load_rig("rlfs"), has_board=False)
     clock.refresh(None, None, [])
     assert clock.take("cam", picture(T0_NS))[0].stamp_ns == T0_NS
@@ -66,7 +66,8 @@ def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still()
     assert [reason.code for reason in clock.verdict().reasons] == ["sync.no_board"]
 
 
-def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it():
+def test_rig_clock_locked_lidar_keeps_utc():
+    """Images of the computer's time are converted to it."""
     rig = load_rig("rlfs").model_copy(update={"sync": synced("rlfs", "cam").sync})
     clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
@@ -83,7 +84,7 @@ def test_an_unlocked_lidar_counts_by_the_computers_clock():
     assert placed.stamp_ns == pytest.approx(T0_NS + 2_000_000_000, abs=2000)
 
 
-def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arrival():
+def test_rig_clock_images_get_pulse_times():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
     rng = np.random.default_rng(3)
@@ -103,7 +104,7 @@ def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arriva
     assert abs(np.mean(errors_ns)) < 2_000_000
 
 
-def test_images_keep_their_time_while_a_clock_that_jumped_has_no_model():
+def test_rig_clock_jumped_images_keep_time():
     clock, board = RigClock(synced("rlfs", "cam"), has_board=True), Board()
     refresh(clock, board, LOCKED)
     came = []
@@ -136,7 +137,7 @@ def test_a_pulse_that_the_camera_missed_is_found_and_told():
     assert (slipped.code, slipped.subject, slipped.figures["n_restarts"]) == ("pulses.slipped", "cam", 1)
 
 
-def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate():
+def test_rig_clock_fast_lines_start_slowly():
     clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), has_board=True, edge_cameras=["davis"])
     assert clock.needs_slow_triggers
     refresh(clock, Board(), LOCKED)

@@ -43,21 +43,21 @@ def test_each_scan_gets_the_picture_nearest_to_its_middle(rig):
     assert pairs(samples, rig)[0] == [(1000, [1003]), (1100, [1102])]
 
 
-def test_scans_without_times_last_as_long_as_the_profile_says(rig):
+def test_pairing_untimed_scan_uses_the_rate(rig):
     assert pairs([scan(1000, has_times=False), image(1000)], rig)[0] == [(1000, [1000])]
 
 
-def test_pictures_that_come_much_later_than_their_scan_still_find_it(rig):
+def test_pairing_late_images_find_their_scan(rig):
     samples = [scan(1000), scan(1100), scan(1200), image(1000), image(1100), image(1200)]
     assert [images for _, images in pairs(samples, rig)[0]] == [[1000], [1100], [1200]]
 
 
-def test_what_lies_outside_the_tolerance_is_left_alone_and_measured(rig):
+def test_pairing_outside_limit_is_measured(rig):
     found, losses = pairs([image(900), scan(1000), image(1080)], rig)
     assert found == [] and alone(losses) == (1, 0.08)
 
 
-def test_a_camera_that_falls_silent_does_not_hold_up_the_rest(rig):
+def test_silent_camera_blocks_no_pairing(rig):
     samples = [image(1000), *(scan(1000 + 100 * k) for k in range(30))]
     counts = Losses()
     frames = pair_by_time(samples, rig, counts)
@@ -78,7 +78,7 @@ def test_samples_without_a_stamp_are_passed_over(rig):
     assert pairs([timeless, scan(1000), image(1000)], rig)[0] == [(1000, [1000])]
 
 
-def test_the_nearest_picture_is_told_of_scans_that_found_none(rig):
+def test_pairing_lone_scans_report_the_gap(rig):
     samples = sorted([image(1000), scan(1000), scan(1100), scan(1200)], key=lambda s: s.stamp_ns)
     found, losses = pairs(samples, rig)
     assert found == [(1000, [1000])]

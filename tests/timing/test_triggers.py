@@ -112,7 +112,8 @@ class Rig:
         return [(m.image.count, m.pulse) for m in matched if self.truth.get(m.image.count) != m.pulse]
 
 
-def test_the_stamp_is_the_pulse_and_the_usual_delay_without_the_jitter():
+def test_trigger_stamp_has_no_jitter():
+    """It is the time of the pulse and the typical delay."""
     rig = Rig(drift=0.0, jitter_ms=4.0)
     _, matched = rig.run()
     errors_ms = [(m.stamp_ns - m.pulse_ns) / MS - 12.0 for m in matched[40:]]
@@ -146,7 +147,8 @@ def test_no_picture_ever_gets_the_pulse_of_another(
 
 @settings(max_examples=10)
 @given(st.integers(0, 10**6))
-def test_what_is_repeated_is_taken_once_and_losses_restart_nothing(seed):
+def test_trigger_losses_do_not_restart(seed):
+    """Repeated lines and images are taken once."""
     rig = Rig(seed=seed, lost_lines=0.1, lost_frames=0.1, repeated=0.1, n_slow=25, n=400)
     matcher, matched = rig.run()
     counts = matcher.counts
@@ -156,7 +158,7 @@ def test_what_is_repeated_is_taken_once_and_losses_restart_nothing(seed):
     assert counts["n_restarts"] == 0
 
 
-def test_the_time_of_a_lost_line_lies_between_its_neighbours():
+def test_trigger_lost_line_is_interpolated():
     rig = Rig(seed=3, lost_lines=0.1, drift=40e-6)
     _, matched = rig.run()
     came = {pulse.count for pulse in rig.streams() if isinstance(pulse, Pulse)}
@@ -168,7 +170,7 @@ def test_the_time_of_a_lost_line_lies_between_its_neighbours():
 
 @settings(max_examples=25)
 @given(st.integers(0, 10**6), st.integers(30, 180))
-def test_a_slip_amid_losses_costs_pictures_and_never_their_truth(seed, where):
+def test_trigger_slip_gives_no_wrong_time(seed, where):
     rig = Rig(seed=seed, missed=(where,), lost_lines=0.05, lost_frames=0.1, jitter_ms=3.0, n_slow=20)
     matcher, matched = rig.run()
     assert rig.wrong(matched) == []
@@ -185,14 +187,15 @@ def test_a_slip_amid_losses_costs_pictures_and_never_their_truth(seed, where):
     ],
     ids=["a pulse missed", "three pulses missed", "numbers skipped by the driver", "late timestamps"],
 )
-def test_slips_of_the_count_are_noticed_and_late_timestamps_are_none(faults, n_most_unmatched, n_restarts):
+def test_trigger_slips_are_noticed(faults, n_most_unmatched, n_restarts):
+    """Late timestamps are not slips."""
     rig = Rig(**faults)
     matcher, matched = rig.run()
     assert rig.wrong(matched) == []
     assert 200 - n_most_unmatched <= len(matched) and matcher.counts["n_restarts"] == n_restarts
 
 
-def test_a_start_that_leaves_a_choice_is_refused_with_what_to_do():
+def test_trigger_ambiguous_start_is_refused():
     rig = Rig(n_slow=0)
     matcher, matched = rig.run(max_delay_ms=100)
     assert matched == []
@@ -239,7 +242,7 @@ def test_a_board_that_begins_anew_is_matched_again():
     assert matcher.counts["n_restarts"] == 1 and len(found) > 90
 
 
-def test_pictures_without_numbers_or_before_the_clock_is_tied_are_not_matched():
+def test_trigger_needs_numbers_and_a_clock():
     matcher = TriggerMatcher("cam", 30 * MS)
     assert matcher.take_image(Image("cam", "frames", HOST_NS, PIXELS, None, 1)) == []
     assert matcher.problem.code == "pulses.clock_not_tied"
@@ -248,7 +251,7 @@ def test_pictures_without_numbers_or_before_the_clock_is_tied_are_not_matched():
     assert matcher.counts["n_unmatched"] == 2
 
 
-def test_pictures_without_pulses_wait_and_are_given_up_in_the_end():
+def test_trigger_images_without_pulse_expire():
     matcher = matcher_of()
     for k in range(200):
         assert matcher.take_image(Image("cam", "frames", HOST_NS + k * 33 * MS, PIXELS, None, k)) == []

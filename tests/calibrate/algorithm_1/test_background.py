@@ -49,7 +49,7 @@ def error_m(captures):
     )
 
 
-def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
+def test_background_person_is_compensated():
     plain = simulate(20, 3)
     captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     found = fit_extrinsic(captures, BOARD, OPTIONS)
@@ -63,7 +63,7 @@ def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
     assert corrected < 0.6 * as_measured
 
 
-def test_what_walls_behind_the_board_take_from_its_edges_is_found_and_made_good():
+def test_background_wall_is_compensated():
     rng = np.random.default_rng(0)
     captures = [lit(c, rng) for c in simulate(20, 5)]
     found = fit_extrinsic(captures, BOARD, OPTIONS)
@@ -80,7 +80,7 @@ def test_the_echo_of_a_person_counts_by_itself():
     assert found.edge_shift_blended_echo_m == pytest.approx(-0.02, abs=0.008)
 
 
-def test_edges_that_no_background_moves_are_left_as_they_are():
+def test_background_without_effect_is_unused():
     """Backgrounds of any brightness and distance, wide steps, lost returns: and no effect on the edges."""
     scenario = Scenario(step_deg=0.4, footprint_m=0.008, lost_share=0.2)
     n_moved = 0

@@ -25,7 +25,7 @@ def all_minima(Q):
     return R.reshape(len(Q), 24, 3, 3), cost.reshape(len(Q), 24)
 
 
-def test_every_global_minimum_is_certified_from_few_and_many_boards_at_any_noise():
+def test_certify_global_minima_all_certified():
     for sigma_m, n_boards, spread in ((0.01, 3, 0.5), (0.1, 4, 0.5), (0.03, 20, 0.5), (0.03, 20, 0.05)):
         Q = problems(60, sigma_m, n_boards, spread)
         R, certificates = solve_globally(Q, np.broadcast_to(np.eye(3), (len(Q), 3, 3)))
@@ -35,7 +35,8 @@ def test_every_global_minimum_is_certified_from_few_and_many_boards_at_any_noise
         np.testing.assert_allclose(rotation_cost(Q, R), cost.min(axis=1), rtol=1e-6, atol=1e-12)
 
 
-def test_no_local_minimum_is_certified_and_its_gap_covers_what_it_misses():
+def test_certify_local_minima_none_certified():
+    """The gap covers the excess cost of each local minimum."""
     Q = problems(80, 0.05, 3, 0.2)
     R, cost = all_minima(Q)
     best = cost.min(axis=1, keepdims=True)
@@ -57,7 +58,8 @@ def test_no_rotation_off_the_minimum_is_certified():
     assert (off.gap >= rotation_cost(Q, nudged) - rotation_cost(Q, R)).all()
 
 
-def test_the_bound_is_tight_for_a_single_board_although_it_determines_nothing():
+def test_certify_single_board_gap_is_small():
+    """The bound is tight although one board does not determine the rotation."""
     Q = problems(5, 0.01, 1)
     _, certificates = solve_globally(Q, np.broadcast_to(np.eye(3), (5, 3, 3)))
     assert (certificates.relative_gap < 1e-3).all()

@@ -45,7 +45,7 @@ def test_a_direction_that_no_plane_sees_is_left_at_zero():
 
 
 @given(st.integers(0, 10_000))
-def test_the_pose_of_exact_planes_is_found_whatever_the_start(seed):
+def test_register_any_start_finds_the_pose(seed):
     normals, anchors, points, R_true, t_true = make_planes(seed)
     Q, L = eliminate_linear(moments_of(normals, anchors, points))
     R_start = exp_so3(np.random.default_rng(seed + 1).normal(size=3) * 2)

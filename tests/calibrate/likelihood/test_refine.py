@@ -32,7 +32,7 @@ def sessions():
     return [fit_extrinsic(simulate(20, seed, REAL), BOARD, ML) for seed in range(5)]
 
 
-def test_errors_of_lasers_hardly_reach_the_extrinsic_and_the_claim_says_so(sessions):
+def test_refine_laser_errors_fit_covariance(sessions):
     errors = np.array([difference(estimate.T_cam_lidar, T_FORWARD) for estimate in sessions])
     squares = np.mean(errors**2, axis=0)
     assert np.degrees(np.sqrt(squares[3:].sum())) < 0.03
@@ -54,7 +54,7 @@ def test_noise_and_constant_errors_come_out_as_simulated(sessions):
         assert estimate.method == "ml"
 
 
-def test_the_claim_is_parted_in_what_differs_between_sessions_and_what_they_share(sessions):
+def test_refine_covariance_parts_add_up(sessions):
     for estimate in sessions:
         figures = estimate.diagnostics
         parts = [getattr(figures, f"sigma_{name}_translation_m") ** 2 for name in ("scatter", "systematic")]
@@ -63,7 +63,8 @@ def test_the_claim_is_parted_in_what_differs_between_sessions_and_what_they_shar
         assert min(parts) > 0.01 * claimed
 
 
-def test_an_offset_common_to_all_ranges_is_found_though_it_is_four_times_what_the_profile_says():
+def test_refine_large_range_offset_is_found():
+    """The offset is four times the standard deviation in the profile."""
     scenario = replace(REAL, range_offset_m=0.02, footprint_m=0.003)
     estimate = fit_extrinsic(simulate(30, 3, scenario), BOARD, ML)
     angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
@@ -85,7 +86,7 @@ def raised(capture, metres_per_rad):
     )
 
 
-def test_the_height_of_the_lasers_is_found_where_the_driver_left_it_out():
+def test_refine_lost_laser_height_is_found():
     captures = [raised(capture, -0.043) for capture in simulate(30, 2, REAL)]
     estimate = fit_extrinsic(captures, BOARD, ML)
     assert abs(estimate.diagnostics.lens_vertical_m_per_rad + 0.043) < 0.006
@@ -94,7 +95,7 @@ def test_the_height_of_the_lasers_is_found_where_the_driver_left_it_out():
     assert np.degrees(np.linalg.norm(error[3:])) < 0.08
 
 
-def test_pictures_that_err_by_more_than_their_corners_are_seen_to_do_so():
+def test_refine_image_tilt_noise_is_found():
     rng = np.random.default_rng(0)
     tilted = [
         replace(o, image=replace(o.image, T_cam_board=o.image.T_cam_board @ pose(exp_so3(phi), np.zeros(3))))
@@ -135,7 +136,7 @@ def test_a_bent_plate_is_found_by_its_bow():
     assert np.linalg.norm(moved[:3]) < 1e-3
 
 
-def test_captures_whose_ring_ends_lie_farther_out_than_the_others_are_seen_to_do_so():
+def test_refine_differing_edge_shift_is_seen():
     """The beam reaches 6 mm over the edges of every second capture, 10 mm over those of the others."""
     near, far = (observations(20, 0, replace(REAL, footprint_m=reach_m)) for reach_m in (0.006, 0.010))
     mixed = [*near[::2], *far[1::2]]
@@ -148,7 +149,7 @@ def test_captures_whose_ring_ends_lie_farther_out_than_the_others_are_seen_to_do
     assert alike.levels.own_shift_m < 0.0005
 
 
-def test_cameras_that_share_captures_share_what_the_lidar_says():
+def test_refine_second_camera_gains_accuracy():
     """A second camera 30 cm aside, with ten times the first one's corner noise, gains from the first one."""
     T_second = pose(exp_so3(np.array([0, 0.2, 0])), np.array([0.3, 0.0, 0.05])) @ T_FORWARD
     rng = np.random.default_rng(5)
@@ -186,7 +187,7 @@ def test_hard_captures_are_no_worse_than_claimed(scenario):
     assert np.degrees(np.linalg.norm(error[3:])) < 0.15
 
 
-def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
+def test_widen_small_covariance_is_scaled():
     seen = observations(20, 6, REAL)
     good = maximise_likelihood([seen], BOARD, [T_FORWARD])
     placement = group_placements(seen)
@@ -199,7 +200,7 @@ def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
     assert np.allclose(cov, factor * too_sure)
 
 
-def test_edges_before_something_close_behind_have_a_shift_of_their_own():
+def test_refine_near_background_has_a_shift():
     """In two of three captures a person stands behind the board's left half: it ends 6 mm sooner there."""
     plain = observations(20, 8, REAL)
     held = [hold_from_behind(o, 0.006) if k % 3 else o for k, o in enumerate(plain)]
@@ -210,7 +211,7 @@ def test_edges_before_something_close_behind_have_a_shift_of_their_own():
     assert np.linalg.norm(error[:3]) < 0.003
 
 
-def test_a_bright_background_takes_the_edges_and_is_allowed_for():
+def test_refine_bright_wall_is_modelled():
     """Two of three boards have a bright wall behind their left half, whose echo wins sooner, by 8 mm."""
     plain = observations(20, 9, REAL)
     lit = [lighten(o, share=0.5, sooner_m=0.008) if k % 3 else o for k, o in enumerate(plain)]

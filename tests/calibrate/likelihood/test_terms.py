@@ -75,7 +75,7 @@ def by_pose(scans, T_lidar_board):
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
+def test_derivatives_by_pose_match_steps(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
     states = [without_errors(scans, T) for T in (T_lidar_board, ahead, behind)]
@@ -88,9 +88,7 @@ def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_bo
 
 
 @pytest.mark.parametrize("lens", [0, 1])
-def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
-    observations, scans, T_lidar_board, lens
-):
+def test_terms_lens_shift_matches_derivative(observations, scans, T_lidar_board, lens):
     """Displace points by 1 mm: the board must appear to be where the derivatives put it."""
     theta = 1e-3
     moved = []
@@ -116,7 +114,7 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
 
 
 @pytest.mark.parametrize("error", [1, 2])
-def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, T_lidar_board, error):
+def test_terms_laser_angles_match_derivative(scans, T_lidar_board, error):
     """One laser points elsewhere by 0.05 mrad: as if its rays were turned."""
     plain_state, ring = without_errors(scans, T_lidar_board), 3
     state = off(plain_state, ("range", "azimuth", "elevation")[error], ring, 5e-5)
@@ -134,7 +132,7 @@ def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, 
 
 
 @pytest.mark.parametrize(("shift", "axis"), [("along azimuth", 0), ("upwards", 2)])
-def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, T_lidar_board, shift, axis):
+def test_terms_shift_matches_displaced_ends(scans, T_lidar_board, shift, axis):
     """Ring ends lie half a millimetre farther along azimuth or upwards than reported; the board stays."""
     state = without_errors(scans, T_lidar_board)
     direction = scans.end_fields[:, :, 0] if axis == 0 else np.tile([0.0, 0.0, 1.0], (len(scans.end_rays), 1))
@@ -165,7 +163,7 @@ def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board)
         )
 
 
-def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans, T_lidar_board):
+def test_weigh_ranges_equals_full_covariance(scans, T_lidar_board):
     ranges = sum_ranges(scans, without_errors(scans, T_lidar_board))
     weighted, log_volume = weigh_ranges(ranges, 0.01, 0.004)
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
@@ -226,7 +224,7 @@ def without_ends(edges):
     return replace(edges, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
 
 
-def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
+def test_evidence_levels_match_full_gaussian(scans, images, T_lidar_board):
     terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board))
     L, G = len(scans.rings), terms.state.layout.z.size
     terms = replace(terms, edges=without_ends(terms.edges))
@@ -260,7 +258,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
         assert np.isclose(fast[1] - fast[0], plainly(changed) - plainly(base), rtol=1e-5)
 
 
-def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, images, T_lidar_board):
+def test_evidence_slopes_match_differences(scans, images, T_lidar_board):
     trust = np.linspace(0.4, 1.0, scans.n_captures)
     terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board), trust)
     priors, base, step = Priors(), Levels(), 1e-3

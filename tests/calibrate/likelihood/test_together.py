@@ -53,7 +53,7 @@ def runs():
     return run([few_on_the_right(16, seed) for seed in range(3)])
 
 
-def test_a_camera_with_few_captures_gains_from_one_with_many(runs):
+def test_join_few_captures_gain_accuracy(runs):
     for own, together in runs:
         before, after = own[RIGHT], together.estimates[RIGHT, "lidar"]
         for part in (slice(0, 3), slice(3, 6)):
@@ -66,7 +66,7 @@ def test_a_camera_with_few_captures_gains_from_one_with_many(runs):
         assert len(together.estimates[LEFT, "lidar"].used) == 16
 
 
-def test_the_cameras_place_to_each_other_is_known_better_than_each_to_the_lidar(runs):
+def test_join_camera_pair_beats_lidar_pairs(runs):
     for _, together in runs:
         T, cov = together.between(RIGHT, LEFT)
         error = difference(T, T_RIGHT_LEFT)
@@ -99,7 +99,7 @@ def test_the_order_of_cameras_does_not_matter(runs):
         assert first.diagnostics.figures() == second.diagnostics.figures()
 
 
-def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
+def test_join_differing_scan_is_refused(runs):
     own, _ = runs[0]
     seen = dict(own[RIGHT].observations)
     lidar = seen["000002"].lidar
@@ -139,7 +139,7 @@ def test_errors_and_claims_of_dozens_of_sessions_are_true():
 
 
 @pytest.mark.long
-def test_a_camera_that_saw_a_placement_once_loses_nothing_where_another_saw_it_often():
+def test_join_repeats_leave_other_camera():
     session = simulate_two(8, 0)
     again = [replace(item, capture=f"{k}{item.capture[1:]}") for k in range(1, 5) for item in session[LEFT]]
     once, often = (

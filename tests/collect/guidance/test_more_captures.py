@@ -28,19 +28,19 @@ def placements():
     return held
 
 
-def test_a_session_with_too_few_captures_gets_at_least_the_minimum(placements):
+def test_plan_few_captures_reaches_minimum(placements):
     rig = load_rig("rlfs")
     for n in (0, 3, 5):
         assert n + plan(rig, placements[:n])["n_captures"] >= rig.quality.min_captures
 
 
-def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements):
+def test_plan_like_boards_adds_tilted_ones(placements):
     alike = np.repeat(placements[:1], 5, axis=0)
     alike[:, :3, 3] *= np.linspace(0.7, 1.0, 5)[:, None]
     assert any(group[3] for group in plan(load_rig("rlfs"), alike)["placements"])
 
 
-def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placements):
+def test_plan_without_nominal_needs_beams(placements):
     rig = load_rig("rlfs").model_copy(update={"nominal_extrinsics": ()})
     assert plan(rig, placements)["n_captures"] >= 1
     assert not plan_captures(changed(rig, lidars__lidar__model="other"), "cam", "lidar", placements)

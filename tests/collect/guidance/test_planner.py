@@ -96,7 +96,7 @@ def test_of_placements_nearly_as_good_the_nearest_is_taken(planner, guided):
     assert reach_m[0] <= reach_m[1]
 
 
-def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
+def test_planner_enough_at_predicted_target(guided):
     modest = replace(model(), target_sigma_rad=np.radians(0.5), target_sigma_m=0.03)
     strict = replace(model(), target_sigma_rad=np.radians(0.02), target_sigma_m=0.001)
     few = Planner(SensorPlace(modest, T_FORWARD), n_places=20)
@@ -105,7 +105,7 @@ def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
     assert not Planner(SensorPlace(strict, T_FORWARD), n_places=20).guide(guided).is_enough
 
 
-def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guided):
+def test_planner_known_placement_is_refused(planner, guided):
     again = perturb(guided[2], np.array([0.02, 0.0, 0.02, 0.03, 0.0, 0.0]))
     refusal = planner.adds_nothing(guided[:6], again)
     assert (refusal.code, refusal.figures["capture"]) == ("calibrate.known_placement", "3")
@@ -113,7 +113,7 @@ def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guid
     assert planner.adds_nothing(guided[:6], again, names=list("abcdef")).figures["capture"] == "c"
 
 
-def test_reach_ends_at_the_arms_the_border_and_the_lidar_s_field():
+def test_reachable_far_poses_are_excluded():
     poses = placements(40, seed=9)
     is_fine = is_reachable(view(), poses)
     assert is_fine.any()
@@ -125,7 +125,7 @@ def test_reach_ends_at_the_arms_the_border_and_the_lidar_s_field():
         assert not is_reachable(view(), moved).any()
 
 
-def test_without_rings_the_whole_plate_is_kept_in_the_field_of_view():
+def test_planner_no_rings_keeps_whole_plate():
     shape = {"elevations_rad": np.radians(np.arange(-20.0, 20.5, 0.5)), "width_rad": np.radians(60.0)}
     n_placed = []
     for pattern in ("rings", "any", "rosette"):
@@ -165,7 +165,7 @@ def crowded():
     return bold, crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015]))
 
 
-def test_beyond_the_target_only_what_was_captured_is_refused():
+def test_planner_target_met_refuses_repeats():
     bold, crowd, present = crowded()
     refusal = bold.adds_nothing(crowd, present)
     assert refusal.code == "calibrate.little_gain" and refusal.figure("gain") < refusal.figure("best_gain")
@@ -176,13 +176,14 @@ def test_beyond_the_target_only_what_was_captured_is_refused():
     assert met.adds_nothing(crowd, crowd[2]).figures["capture"] == "3"
 
 
-def test_where_it_was_sent_a_board_is_refused_only_if_it_was_captured_there():
+def test_planner_asked_place_is_accepted():
+    """A board at the requested placement is refused only if it was captured there."""
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present, asked=present) is None
     assert bold.adds_nothing(crowd, crowd[2], asked=crowd[2]).figures["capture"] == "3"
 
 
-def test_no_board_is_refused_for_a_better_place_out_of_reach():
+def test_planner_unreachable_gain_is_ignored():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present, avoid=bold.candidates) is None
 

@@ -69,7 +69,7 @@ def test_predicted_scatter_is_that_of_many_sessions(poses):
         assert 0.9 < expected / actual < 4.0
 
 
-def test_a_placement_more_makes_it_better_and_a_second_of_the_same_kind_less_so(poses):
+def test_precision_repetition_helps_less(poses):
     before = np.array(sigmas(predict_covariance(model(), poses[:6], T_FORWARD)))
     after = np.array(sigmas(predict_covariance(model(), poses[:7], T_FORWARD)))
     again = np.array(sigmas(predict_covariance(model(), poses[[*range(7), 6]], T_FORWARD)))
@@ -85,7 +85,7 @@ def test_noisier_captures_raise_the_prediction(poses):
     assert widened == pytest.approx(2 * np.array(calm))
 
 
-def test_rings_their_points_and_their_ends_are_those_of_a_scan():
+def test_cross_board_matches_a_scan():
     poses = invert(T_FORWARD) @ placements(20, seed=1)
     rings = cross_board(model(), poses)
     rng = np.random.default_rng(2)

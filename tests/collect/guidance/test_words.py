@@ -40,7 +40,7 @@ def test_one_change_is_one_instruction(changes, text):
     assert words(**changes) == [text]
 
 
-def test_left_is_the_left_of_the_person_who_faces_the_camera():
+def test_words_left_is_that_of_the_person():
     left = build_pose(VIEW, replace(HERE, right_m=0.6))
     pixels, _ = VIEW.model.lens.project(left[:3, 3])
     middle, _ = VIEW.model.lens.project(build_pose(VIEW, HERE)[:3, 3])
@@ -87,7 +87,7 @@ def test_following_every_word_leads_there():
         assert is_there(VIEW, present, wanted)
 
 
-def test_the_board_is_not_there_while_something_is_to_be_done_by_far():
+def test_is_there_distant_pose_is_false():
     held = build_pose(VIEW, HERE)
     assert not is_there(VIEW, build_pose(VIEW, replace(HERE, tilt_deg=25.0)), held)
     assert not is_there(VIEW, build_pose(VIEW, replace(HERE, right_m=0.4)), held)

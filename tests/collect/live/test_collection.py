@@ -23,7 +23,7 @@ HERE = "000000 shows the board here"
 
 
 @pytest.mark.long
-def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path):
+def test_collect_still_boards_are_captured(tmp_path):
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         report = collect_live(session, show.sources, QUICK, states.append)
@@ -58,7 +58,7 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path):
 
 
 @pytest.mark.long
-def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path):
+def test_collect_keys_capture_skip_and_stop(tmp_path):
     asked = ["next", "capture"]
     states = []
     show = Show(placements()[:1], each_s=100.0)
@@ -79,7 +79,7 @@ def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path):
 
 
 @pytest.mark.long
-def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice(tmp_path):
+def test_collect_take_back_counts_correctly(tmp_path):
     path, states = tmp_path / "session", list[LiveState]()
     show = Show(placements(), each_s=2.0)
     # Both, the last first; then one that is gone already, as a second tap on a slow page asks for.
@@ -137,7 +137,8 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(tmp_path, monkeypatc
 
 
 @pytest.mark.long
-def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_neither(tmp_path):
+def test_collect_known_placement_is_ignored(tmp_path):
+    """Nor does the capture key take it."""
     states, told_s = list[LiveState](), list[float]()
     show = Show(placements()[:1], each_s=100.0)
 
@@ -154,7 +155,7 @@ def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_ne
     assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
 
 
-def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(tmp_path):
+def test_collect_silent_sensors_hide_board(tmp_path):
     show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
 
     def watch(state):
@@ -173,7 +174,7 @@ def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(t
     assert [stream.sees_board for stream in told.streams] == [None] * len(told.streams)
 
 
-def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(tmp_path):
+def test_collect_lost_sensor_keeps_captures(tmp_path):
     states = []
     show = Show(placements(), each_s=2.0)
 
@@ -195,7 +196,7 @@ def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(
 
 
 @pytest.mark.long
-def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path):
+def test_collect_unattended_run_ends(tmp_path):
     show = Show(placements()[:1], each_s=100.0)
     options = replace(QUICK, n_wanted=5, idle_s=8.0)
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
@@ -221,7 +222,7 @@ def met(tmp_path):
 
 
 @pytest.mark.long
-def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met):
+def test_collect_more_than_enough_is_guided(met):
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.open(met, writable=True) as session:
         report = collect_live(session, show.sources, replace(QUICK, n_wanted=14), states.append)
@@ -241,7 +242,7 @@ def test_who_wants_no_more_than_enough_is_done_at_once(met):
 
 
 @pytest.mark.long
-def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met):
+def test_collect_guides_to_the_other_camera(met):
     profile = Session.open(met).rig
     nominal = profile.nominal_extrinsics[0]
     both = (nominal, changed(nominal, camera="right"))

@@ -35,14 +35,14 @@ def present():
     return boards()[0].T_cam_board
 
 
-def test_a_board_is_captured_once_when_it_was_held_long_enough():
+def test_gate_held_board_is_captured_once():
     gate = StillBoards(rig(), HOLD_S)
     taken = [step for step in range(40) if gate.take(detection(step))]
     # Half a second tells that it stands still, the hold comes after that.
     assert taken == [12]
 
 
-def test_a_board_that_is_moved_on_before_its_time_is_not_captured():
+def test_gate_early_moved_board_is_skipped():
     gate = StillBoards(rig(), HOLD_S)
     shifts = [0.0] * 9 + [30.0 * k for k in range(1, 6)] + [180.0] * 14
     taken = [step for step, shift in enumerate(shifts) if gate.take(detection(step, shift))]
@@ -69,7 +69,7 @@ def test_what_is_said_counts_the_hold_down_and_then_goes_on():
     assert all(each.headline not in ("", "hold still") for each in said[13:])
 
 
-def test_a_place_that_adds_nothing_is_refused_while_the_board_stands_there():
+def test_gate_known_place_stays_refused():
     (guide,) = make_guides(rig())
     guide.add("000007", present())
     guide.plan(None, 0.0)

@@ -26,7 +26,7 @@ def guide():
     return guide
 
 
-def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide):
+def test_guide_capture_lowers_prediction(guide):
     sigmas = []
     for k in range(8):
         guide.plan(None, float(k))
@@ -41,7 +41,7 @@ def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide
     assert guide.n_held == 8
 
 
-def test_placements_before_two_lidars_are_counted_if_they_differ():
+def test_guide_two_lidars_counts_placements():
     (guide,) = make_guides(load_rig(str(TWO_LIDARS)))
     assert guide.key == ("front", "") and guide.lidar == "side"
     assert guide.problem is not None
@@ -73,7 +73,7 @@ def test_a_capture_that_is_taken_back_is_forgotten(guide):
     assert guide.adds_nothing(last) is None
 
 
-def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough():
+def test_guide_explains_missing_captures():
     modest = changed(rig(), calibration__target_sigma_deg=5.0, calibration__target_sigma_m=0.5)
     (guide,) = make_guides(modest)
     assert guide.explain() is None and guide.predict() is None, "before the first capture nothing is known"
@@ -92,7 +92,7 @@ def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough():
     assert predicted.figures["n_captures"] == 6
 
 
-def test_what_more_captures_cannot_reach_is_said_without_their_number():
+def test_guide_unreachable_target_no_number():
     (guide,) = make_guides(changed(rig(), calibration__target_sigma_m=0.003))
     for k in range(12):
         guide.plan(None, float(k))
@@ -104,7 +104,7 @@ def test_what_more_captures_cannot_reach_is_said_without_their_number():
     assert why.figure("position_mm") > why.figure("limit_mm") == pytest.approx(2.7)
 
 
-def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide):
+def test_guide_keeps_target_until_given_up(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     guide.plan(None, GIVE_UP_S - 1)
@@ -120,7 +120,7 @@ def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide):
         assert np.linalg.norm(guide.wanted[:3, 3] - old[:3, 3]) > 0.3
 
 
-def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide):
+def test_guide_no_nominal_starts_calibrated(guide):
     (blind,) = make_guides(changed(rig(), nominal_extrinsics=()))
     blind.plan(None, 0.0)
     assert blind.problem is not None and blind.problem.code == "guide.no_nominal"
@@ -136,7 +136,7 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
     assert blind.problem is not None and blind.wanted is None, "what was learned was taken back"
 
 
-def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance():
+def test_guide_unknown_beams_has_no_target():
     (guide,) = make_guides(changed(rig(), lidars__lidar__model="HDL-64"))
     guide.plan(None, 0.0)
     assert guide.problem is not None and guide.problem.code == "guide.no_beams"
@@ -144,7 +144,7 @@ def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance():
     assert guide.outline_px(np.eye(4)) is None
 
 
-def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guide):
+def test_guide_refused_placement_is_replaced(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     assert first is not None
@@ -155,7 +155,7 @@ def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guid
     assert guide.wanted is not None and not np.array_equal(guide.wanted, first)
 
 
-def test_patience_is_not_lost_with_a_guide_that_is_not_followed(guide):
+def test_guide_unasked_time_is_not_counted(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     for now_s in (10.0, 50.0, 90.0):
@@ -205,7 +205,7 @@ def follow_guide(rig, n_wanted, person=None, can_be_held=lambda _T_cam_board: Tr
     return walk
 
 
-def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_captures_as_wanted():
+def test_walk_continued_gets_new_placements():
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
     assert len(walk.proposed) >= 20
@@ -225,7 +225,7 @@ def test_half_a_room_and_a_careless_person_will_do():
     assert all(is_left(T_cam_board) for T_cam_board in walk.captured)
 
 
-def test_who_reaches_nothing_is_asked_for_other_places_until_patience_ends():
+def test_walk_unreachable_ends_after_10_min():
     walk = follow_guide(rig(), 3, can_be_held=lambda _T_cam_board: False)
     assert not walk.captured and walk.simulated_s == pytest.approx(600.0, abs=10.0)
     places = np.array([T_cam_board[:3, 3] for T_cam_board, _ in walk.proposed])

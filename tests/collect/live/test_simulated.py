@@ -44,7 +44,7 @@ def test_the_person_walks_to_where_the_board_is_wanted(scene, view):
     assert took_s == pytest.approx(way_m / WALK_MPS, abs=0.4)
 
 
-def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(scene, view):
+def test_person_blocked_by_wall_goes_partway(scene, view):
     reached, _ = walk(scene, view, HeldPose(0.0, 12.0, 0.0, 0.0, 0.0, 45.0))
     # The room ends nine metres ahead.
     assert 3.0 < reached[2, 3] < 9.0

@@ -61,7 +61,7 @@ def test_a_collection_that_is_killed_loses_no_capture(wire, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire, reel, tmp_path):
+def test_recording_beside_collect_is_usable(wire, reel, tmp_path):
     rig, record = wire(), tmp_path / "recording"
     live, later = tmp_path / "live", tmp_path / "later"
     began_ns = time.time_ns()
@@ -89,7 +89,7 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire, reel, 
 
 
 @pytest.mark.long
-def test_a_camera_whose_command_ends_is_named_where_nothing_was_captured(wire, tmp_path):
+def test_collect_ended_camera_is_named(wire, tmp_path):
     rig = wire()
     command = ("sh", "-c", "echo no such camera >&2; exit 3")
     broken = changed(rig.rig, cameras__cam__driver__command=command)
@@ -101,7 +101,7 @@ def test_a_camera_whose_command_ends_is_named_where_nothing_was_captured(wire, t
 
 
 @pytest.mark.long
-def test_captures_appear_by_themselves_and_hold_what_was_sent(wire, reel, tmp_path):
+def test_collect_captures_hold_what_was_sent(wire, reel, tmp_path):
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0", "--captures", "2") as collecting:
         assert collecting.wait() == 0
@@ -116,7 +116,7 @@ def test_captures_appear_by_themselves_and_hold_what_was_sent(wire, reel, tmp_pa
 
 
 @pytest.mark.long
-def test_a_collection_without_captures_ends_in_time_and_says_what_to_check(wire, tmp_path):
+def test_collect_without_captures_times_out(wire, tmp_path):
     with Collecting(wire().profile, tmp_path / "session", "--hold", "30", "--timeout", "1") as collecting:
         assert collecting.wait() == 6
     assert len(errors(collecting.said)) == 1

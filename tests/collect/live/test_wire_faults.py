@@ -28,7 +28,7 @@ time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)
 
 
 @pytest.mark.long
-def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire, tmp_path):
+def test_collect_unplugged_camera_reconnects(wire, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -44,7 +44,7 @@ def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire, tmp_path
 
 
 @pytest.mark.long
-def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(wire, reel, tmp_path):
+def test_collect_silent_lidar_reconnects(wire, reel, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -66,7 +66,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(wire, reel, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire, tmp_path):
+def test_collect_lidar_gone_exits_with_5(wire, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -78,7 +78,7 @@ def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire, tmp_
 
 
 @pytest.mark.slow
-def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(wire, reel, tmp_path):
+def test_collect_counter_jump_uses_arrival(wire, reel, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -112,7 +112,7 @@ def test_a_computer_whose_clock_is_set_goes_on(wire, reel, tmp_path, set_s):
 
 
 @pytest.mark.long
-def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire, tmp_path):
+def test_collect_full_disk_keeps_captures(wire, tmp_path):
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -129,7 +129,7 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire, tmp_path):
 
 
 @pytest.mark.long
-def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_captures(wire, tmp_path):
+def test_collect_recording_disk_full_exits_5(wire, tmp_path):
     rig, session, streams = wire(), tmp_path / "session", tmp_path / "streams"
     with Collecting(rig.profile, session, "--hold", "0", "--record", str(streams)) as collecting:
         collecting.wait_for_captures(1)

@@ -25,7 +25,7 @@ def read(path, losses=None):
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing"])
-def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(tmp_path, style):
+def test_frames_are_stamped_at_mid_exposure(tmp_path, style):
     frames = [RawFrame(START_US + 40_000 * k, 8001, GREY, style) for k in range(3)]
     found = read(write_davis(tmp_path / "a.aedat4", [random_events(500, 1, start_us=START_US)], frames))
     assert [f.mid_exposure_ns for f in found] == [
@@ -34,7 +34,7 @@ def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(tmp_p
     assert all(f.exposure_ns == 8_001_000 and np.array_equal(f.pixels, GREY) for f in found)
 
 
-def test_an_exposure_that_is_not_known_leaves_the_stamp_as_it_is(tmp_path):
+def test_frame_unknown_exposure_keeps_stamp(tmp_path):
     (frame,) = read(write_davis(tmp_path / "a.aedat4", [], [RawFrame(START_US, 8000, GREY, "stamp only")]))
     assert (frame.mid_exposure_ns, frame.exposure_ns) == (START_US * 1000, 0)
 

@@ -129,7 +129,8 @@ def test_packets_of_a_topic_are_one_recording(tmp_path, name, encoding):
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
-def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(tmp_path, name):
+def test_codecs_broken_packets_are_counted(tmp_path, name):
+    """The first broken one is named."""
     is_ros1 = name == "a.bag"
     sent = messages(is_ros1)
     for i in (5, 9, 17):
@@ -146,7 +147,7 @@ def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(t
     assert has_note(recording.notes, "5 packets lost"), "the broken ones and two that never came"
 
 
-def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path):
+def test_codecs_damaged_record_ends_events(tmp_path):
     path = tmp_path / "a.bag"
     events = random_events(100_000, 3, start_us=1_700_000_000_000_000, step_us=100)
     write_event_bag(path, [events])

@@ -78,7 +78,7 @@ WRITERS: dict[str, Callable[[Path, Events], object]] = {
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path, name):
+def test_event_files_return_every_event(tmp_path, name):
     WRITERS[name](tmp_path / name, EVENTS)
     recording = open_events(tmp_path / name, sensor="davis")
     shift_us = START_US if name == "a.raw" else 0

@@ -57,7 +57,8 @@ def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(jitter_us, seed, cuts
     assert stamps_us(recording) == sorted(t_us.tolist())
 
 
-def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound():
+def test_events_clock_set_back_is_refused():
+    """Sound events before are delivered."""
     first, second = np.arange(1000) * 1000, np.arange(1000) * 1000 - 5_000_000
     delivered = []
     with pytest.raises(SourceError, match=r"5\.999 s") as caught:
@@ -67,7 +68,7 @@ def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound()
     assert delivered == (first * 1000).tolist()
 
 
-def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted():
+def test_events_before_clock_set_are_counted():
     before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
     recording = record(columns(before), columns(after[:400]), columns(after[400:]))
     assert stamps_us(recording) == after.tolist()
@@ -87,7 +88,8 @@ def test_a_single_stray_stamp_is_left_out_and_counted(stray_us, at):
     assert has_note(recording.notes, "1 events", "stray")
 
 
-def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many():
+def test_events_off_the_sensor_are_skipped():
+    """Many of them are refused."""
     stretch = columns(np.arange(1000))
     few, many = stretch.x.copy(), stretch.x.copy()
     few[7], many[::2] = 2000, 400
@@ -98,7 +100,7 @@ def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many():
         list(record(replace(stretch, x=many)))
 
 
-def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least():
+def test_events_own_clock_uses_least_delay():
     delays_ms = [7, 3, 5]
     recording = record(
         *(
@@ -115,7 +117,7 @@ def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least():
     assert stamps_us(unknown) == [1] and not unknown.notes
 
 
-def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept():
+def test_events_extreme_stamps_are_skipped():
     stretch = columns(range(1000))
     stretch.t_ns[[100, 200, 300, 400]] = MAX_TIME_NS, -MAX_TIME_NS, (1 << 63) - 1, -(1 << 63)
     recording = record(stretch)

@@ -16,7 +16,7 @@ def events_at(t_ms, x, y, polarity):
     return Events("cam", t_ns, *columns, FOLDING.width_px, FOLDING.height_px)
 
 
-def test_only_events_shortly_before_the_picture_are_taken_along():
+def test_recent_events_are_just_before_image():
     shown = recent_events(IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4))
     assert shown.x.tolist() == [2, 3]
     n = 20_000

@@ -94,7 +94,8 @@ def test_a_point_appears_where_the_camera_sees_it():
     assert (u, v) == pytest.approx(tuple((truth + 0.5) * 3 - 0.5), abs=0.8)
 
 
-def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn():
+def test_overlay_hidden_points_are_not_drawn():
+    """Behind the camera, or folded by the distortion."""
     behind = wall(-2.0)
     # At 60 deg r = 1.73, beyond the fold of 1 - 0.4 r^2 at r = 0.91, where the polynomial draws it at -0.35.
     folded = np.stack([np.ones(20), np.full(20, np.tan(np.radians(60))), np.linspace(-0.2, 0.2, 20)], axis=1)

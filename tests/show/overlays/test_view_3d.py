@@ -31,7 +31,7 @@ def test_a_frustum_projects_onto_the_image_s_corners(model):
     assert edges.shape == (8, 2) and edges.max() == 4
 
 
-def test_without_a_display_no_window_opens_and_the_error_says_what_to_do(monkeypatch):
+def test_view_without_display_is_an_error(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -41,7 +41,7 @@ def test_without_a_display_no_window_opens_and_the_error_says_what_to_do(monkeyp
 
 
 @pytest.mark.long
-def test_a_picture_shows_seen_points_in_their_colour_and_others_grey(tmp_path):
+def test_view_unseen_points_are_grey(tmp_path):
     path = tmp_path / "view.png"
     try:
         draw_picture(path, _wall(), [CameraIn3D(LENS, FORWARD)])

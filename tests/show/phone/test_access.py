@@ -31,7 +31,7 @@ def test_without_the_token_there_is_nothing(query):
             watcher.watch(query)
 
 
-def test_the_link_opens_the_page_and_its_cookie_all_it_loads():
+def test_link_sets_cookie_for_all_requests():
     with Preview(port=0, token="abcdefgh") as preview, Watcher(preview.urls[0]) as watcher:
         preview.publish(state())
         status, headers, content = watcher.get("?token=abcdefgh")
@@ -44,7 +44,7 @@ def test_the_link_opens_the_page_and_its_cookie_all_it_loads():
         assert watcher.next_state()[0]["n_captures"] == 7
 
 
-def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(preview):
+def test_pages_load_nothing_and_are_not_kept(preview):
     with Watcher(preview.urls[0]) as watcher:
         for path in ("", "page.js", "nothing-here"):
             headers = watcher.get(path)[1]

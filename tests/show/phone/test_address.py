@@ -46,7 +46,7 @@ def test_a_port_in_use_is_said_to_be():
         pass  # it is free again at once
 
 
-def test_links_lead_to_addresses_of_this_computer_that_others_reach():
+def test_links_reach_this_computer():
     with listen("0.0.0.0", 0) as opened:
         port = opened.getsockname()[1]
         found = links(opened, "abcdefgh")

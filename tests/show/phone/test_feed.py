@@ -69,7 +69,7 @@ def test_pictures_are_made_small_enough_for_a_phone(shape, size):
     assert abs(decoded.mean() - pixels.mean()) < 2
 
 
-def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview):
+def test_feed_stuck_page_delays_nothing(preview):
     big = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(5)]
     with Watcher(preview.urls[0]) as stuck, Watcher(preview.urls[0]) as quick:
         stuck.watch()

@@ -46,7 +46,7 @@ def test_a_line_that_falls_silent_is_opened_anew(preview, browser):
     shown(preview, page, has_text("count", "9"), n_captures=9)
 
 
-def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser):
+def test_page_shows_no_news_and_the_end(browser):
     preview = Preview(port=0)
     page = browser.open(preview.start())
     shown(preview, page, has_text("count", "7"))

@@ -90,7 +90,7 @@ def _compare_with_picture(page, is_mirrored):
     assert (wanted[:, 0].mean() < found[:, 0].mean()) == is_mirrored
 
 
-def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview, browser):
+def test_arrow_ends_when_the_board_is_there(preview, browser):
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
     # From (150, 130) towards (480, 180), whose outline begins at x = 400.

@@ -41,7 +41,7 @@ def test_sounds_are_played_once_each_after_a_tap(preview, browser):
 
 
 @pytest.mark.long
-def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(preview, browser):
+def test_voice_reads_settled_words_once(preview, browser):
     # Headless browsers have no voices: this one remembers what it is told to say.
     listening = """
       window.said = [];

@@ -18,7 +18,7 @@ _DRAWINGS = 5
 
 
 @pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
-def test_it_is_small_requests_nothing_and_every_link_leads_to_one_place(which, request):
+def test_page_is_small_and_self_contained(which, request):
     text = request.getfixturevalue(which)
     assert len(text) < 3_000_000
     assert "http:" not in text and "https:" not in text and "<script" not in text
@@ -49,7 +49,7 @@ def test_points_on_the_board_lie_where_residuals_say(one):
     assert gather(far, board, lens).plane_m.mean() > 0.05
 
 
-def test_the_pose_is_that_of_the_camera_s_body_in_the_lidar_s_frame(one, one_page):
+def test_page_pose_is_camera_in_lidar_frame(one, one_page):
     found = re.findall(r"<td>([xyz])</td><td class=\"figure\">(\S+) m</td>", one_page)
     assert [float(value) for _, value in found] == pytest.approx(invert(one.T_cam_lidar)[:3, 3], abs=1e-4)
 
@@ -66,13 +66,13 @@ def test_a_failed_result_is_explained(one, page):
 
 
 @pytest.mark.parametrize("has_previous", [True, False])
-def test_the_earlier_result_is_named_only_where_there_is_one(one, page, has_previous):
+def test_page_names_previous_if_there_is_one(one, page, has_previous):
     failed = replace(one, verdict="fail")
     text = page(RLFS, failed, has_previous=has_previous)
     assert ("previous/" in text) is has_previous
 
 
-def test_a_result_that_was_read_from_a_file_lacks_only_its_boards(page):
+def test_page_of_file_lacks_only_boards(page):
     text = page(load_rig("rles"), without_boards())
     assert "<svg " not in text
     assert "näher – ¼ m" in text

@@ -39,7 +39,7 @@ def test_the_capture_that_stands_out_comes_first():
     assert worst_first([], []) == []
 
 
-def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(one, page):
+def test_page_shows_captures_and_the_worst(one, page):
     residuals = list(one.residuals)
     residuals[3] = residuals[3]._replace(plane_mean_m=0.2)
     text = page(RLFS, replace(one, residuals=tuple(residuals)))
