@@ -33,7 +33,7 @@ def cameras(session):
 
 
 @pytest.mark.long
-def test_a_camera_without_result_exits_with_6_and_the_others_results_stand(lce_rig, with_second):
+def test_camera_without_result_exits_with_6(lce_rig, with_second):
     outcome = lce_rig("calibrate", with_second)
     assert outcome.code == 6
     assert "camera right" in outcome.err and "--camera davis" in outcome.err
@@ -58,7 +58,7 @@ def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second,
 
 
 @pytest.mark.long
-def test_a_reference_that_names_no_sensors_is_that_of_one_camera_only(lce_rig, with_second):
+def test_reference_without_names_is_of_one_camera_only(lce_rig, with_second):
     truth = json.loads((with_second / "truth.json").read_text())
     (with_second / "bare.json").write_text(json.dumps({"T_cam_lidar": truth["T_cam_lidar"]}))
     outcome = lce_rig("calibrate", with_second, "--reference", with_second / "bare.json")
@@ -96,7 +96,7 @@ def of_two(tmp_path_factory):
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["paper", "ml"])
-def test_two_cameras_are_calibrated_to_the_truth_and_to_each_other(lce_rig, of_two, tmp_path, method):
+def test_two_cameras_are_near_truth_and_each_other(lce_rig, of_two, tmp_path, method):
     session = tmp_path / "session"
     shutil.copytree(of_two, session)
     outcome = lce_rig("calibrate", session, "--method", method)

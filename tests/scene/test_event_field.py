@@ -14,7 +14,7 @@ def events_at(x, y):
     return Events("cam", np.arange(n), x.astype(np.uint16), y.astype(np.uint16), on, WIDTH, HEIGHT)
 
 
-def test_an_edge_that_moved_stands_out_and_is_near_its_pixels_only():
+def test_moved_edge_stands_out_near_its_pixels_only():
     y = np.repeat(np.arange(HEIGHT), 3)
     pyramid = build_event_pyramid(events_at(np.full(len(y), 200), y), FOCAL_PX)
     upright, _ = pyramid.levels[-1]

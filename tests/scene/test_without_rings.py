@@ -83,7 +83,7 @@ def drives(recordings):
 
 @pytest.mark.dataset
 @pytest.mark.parametrize("axis", [None, *range(6)])
-def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged(drives, axis):
+def test_drives_changed_by_1_deg_or_20_cm_never_hold(drives, axis):
     for views in list(combinations(drives.views, 3))[::31]:
         three = drives._replace(views=list(views))
         if axis is None:

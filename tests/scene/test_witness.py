@@ -89,7 +89,7 @@ def session_of(seen, path, images_of):
     return Session.open(path)
 
 
-def test_a_scene_without_features_cannot_tell_and_changes_no_verdict(seen, tmp_path):
+def test_scene_without_features_changes_no_verdict(seen, tmp_path):
     def even(capture):
         (image,) = capture.images
         return [replace(image, pixels=np.full_like(image.pixels, 90))]
