@@ -4,7 +4,7 @@
 
     rig = lce.load_rig("rlfs")
     session = lce.collect_from(rig, "recording.bag", "session/")
-    result = lce.calibrate(session)                  # .pairs[0].T_cam_lidar, .cov, .verdict, .findings
+    result = lce.calibrate_session(session)          # .pairs[0].T_cam_lidar, .cov, .verdict, .findings
     result.write()                                   # what `lce-rig calibrate` writes
     lce.verify(session, result).write("overlays/")
 
@@ -12,9 +12,7 @@ docs/python-api.md lists every public name. Each is imported when it is first us
 """
 
 import os
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,13 +30,13 @@ if TYPE_CHECKING:
     )
     from lce_rig.core.findings import Finding, Refusal
     from lce_rig.detect.detection import Detections
-    from lce_rig.export import export
+    from lce_rig.export import write_exports
     from lce_rig.export.extrinsics import Reference, read_reference
     from lce_rig.io.recording import SourceOptions
-    from lce_rig.pipeline.calibration import calibrate
+    from lce_rig.pipeline.calibration import calibrate_session
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
-    from lce_rig.pipeline.detect_session import detect
+    from lce_rig.pipeline.detect_session import detect_boards
     from lce_rig.pipeline.pair_drift import DriftReport
     from lce_rig.pipeline.result_files import Result
     from lce_rig.pipeline.verification import Verification, verify
@@ -71,16 +69,16 @@ __all__ = [
     "SourceOptions",
     "UsageError",
     "Verification",
-    "calibrate",
+    "calibrate_session",
     "collect_from",
-    "detect",
+    "detect_boards",
     "drift",
-    "export",
     "load_rig",
     "read_reference",
     "read_result",
     "repeat",
     "verify",
+    "write_exports",
 ]
 __version__ = "0.1.0"
 
@@ -97,15 +95,15 @@ _HOMES = {
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
     "lce_rig.core.findings": ("Finding", "Refusal"),
     "lce_rig.detect.detection": ("Detections",),
-    "lce_rig.export": ("export",),
+    "lce_rig.export": ("write_exports",),
     "lce_rig.export.extrinsics": ("Reference", "read_reference"),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
-    "lce_rig.pipeline.detect_session": ("detect",),
+    "lce_rig.pipeline.detect_session": ("detect_boards",),
     "lce_rig.pipeline.pair_drift": ("DriftReport",),
     "lce_rig.pipeline.watch_drift": ("drift",),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
-    "lce_rig.pipeline.calibration": ("calibrate",),
+    "lce_rig.pipeline.calibration": ("calibrate_session",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
@@ -114,23 +112,14 @@ _HOMES = {
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 
-class _FrontDoor(ModuleType):
-    """Imports public names when they are used, and keeps functions in front of packages of the same name."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _HOME:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(_HOME[name]), name)
-        setattr(self, name, value)
-        return value
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # Importing the package lce_rig.detect binds its name here, and would hide the function.
-        if name not in _HOME or not isinstance(value, ModuleType):
-            super().__setattr__(name, value)
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *__all__})
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
 
 
-sys.modules[__name__].__class__ = _FrontDoor
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,7 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
     """Make a session of the folder, calibrate it, and write the result and the overlays."""
     rig = lce.load_rig(rig_name)
     session = lce.collect_from(rig, folder, session_folder)
-    result = lce.calibrate(session)
+    result = lce.calibrate_session(session)
     for pair in result.pairs:
         print(f"{pair.camera} and {pair.lidar}: {pair.verdict}")
         print(np.array_str(pair.T_cam_lidar, precision=4, suppress_small=True))

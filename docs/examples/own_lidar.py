@@ -45,7 +45,7 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
             # A second run stores nothing twice.
             if session.find_duplicate([image], [scan]) is None:
                 session.add_capture([image], [scan], meta={"source": path.name})
-        for pair in lce.calibrate(session).pairs:
+        for pair in lce.calibrate_session(session).pairs:
             print(f"{pair.camera} and {pair.lidar}: {pair.verdict}, {len(pair.captures_used)} captures")
             print(pair.T_cam_lidar)
 

@@ -185,13 +185,13 @@ def calibrate(
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
     with show.progress_bar("detecting") as progress:
-        detections = lce.detect(opened, progress=progress)
+        detections = lce.detect_boards(opened, progress=progress)
     show.warn_of(unlike_models(opened, detections))
     for absent in absent_channels(rig, detections, channels):
         show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
     with show.progress_bar("calibrating") as progress:
         try:
-            result = lce.calibrate(
+            result = lce.calibrate_session(
                 opened,
                 detections,
                 options=lce.CalibrateOptions(method),

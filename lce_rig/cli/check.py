@@ -40,7 +40,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
             f"Add some: `lce-rig collect --rig RIG {session}`, or with `--from RECORDING`.",
         )
     with show.progress_bar("detecting") as progress:
-        detections = lce.detect(opened, progress=progress)
+        detections = lce.detect_boards(opened, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, progress=progress)

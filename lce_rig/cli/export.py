@@ -96,7 +96,7 @@ def export(
         output.mkdir(parents=True, exist_ok=True)
         findings: list[Finding] = []
         earlier = {path.name for path in output.iterdir()}
-        files = lce.export(
+        files = lce.write_exports(
             pairs,
             opened.rig,
             output,

@@ -179,7 +179,7 @@ def usual_formats(rig: Rig) -> tuple[str, ...]:
     return tuple(rig.exports) or USUAL
 
 
-def export(
+def write_exports(
     calibrations: Sequence[Calibration],
     rig: Rig,
     folder: Path | str,

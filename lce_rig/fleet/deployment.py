@@ -23,7 +23,7 @@ from lce_rig.core.errors import (
 )
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.export import export
+from lce_rig.export import write_exports
 from lce_rig.fleet.findings import (
     DEPLOY_FAILED,
     DEPLOY_MOVED,
@@ -323,7 +323,7 @@ def _stage(
     saved = read_result(result / RESULT)
     folder.mkdir()
     # A failed result is one of the objections, which are decided on together.
-    export(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
+    write_exports(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     return saved
 

@@ -197,8 +197,8 @@ def without_result(row: Row, status: Status, cause: Finding) -> Row:
 def _calibrate(
     registry: Registry, session: Session, row: Row, settings: Settings, start_s: float
 ) -> list[Row]:
-    detections = lce.detect(session, n_threads=1)
-    result = lce.calibrate(session, detections, options=lce.CalibrateOptions(settings.method))
+    detections = lce.detect_boards(session, n_threads=1)
+    result = lce.calibrate_session(session, detections, options=lce.CalibrateOptions(settings.method))
     saved = result.file()
     row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
     solved = {(c.camera, c.lidar) for c in result.pairs}

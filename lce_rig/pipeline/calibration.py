@@ -52,7 +52,7 @@ from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
+from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect_boards
 from lce_rig.pipeline.findings import FEW_DETECTED, LIDAR_ABSENT, SHORTAGE, UNCONNECTED, few_detected
 from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
@@ -132,7 +132,7 @@ class _Link(NamedTuple):
     exchanged: list[Finding]
 
 
-def calibrate(
+def calibrate_session(
     session: Session | str | Path,
     detections: Detections | None = None,
     *,
@@ -148,7 +148,7 @@ def calibrate(
 
     Args:
         session: its folder, or one that is open for reading.
-        detections: of the session; None detects the board first, as `detect` does by default.
+        detections: of the session; None detects the board first, as `detect_boards` does by default.
         options: of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
@@ -162,7 +162,7 @@ def calibrate(
     """
     session = session if isinstance(session, Session) else Session.open(session)
     if detections is None:
-        detections = detect(session)
+        detections = detect_boards(session)
     calibrations, shortages = calibrate_detections(
         session.rig,
         detections,
@@ -206,7 +206,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options, cameras, channels, progress: as of `calibrate`.
+        options, cameras, channels, progress: as of `calibrate_session`.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.

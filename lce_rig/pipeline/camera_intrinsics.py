@@ -38,7 +38,7 @@ from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, lens_settings, parse_rig, set_value
 from lce_rig.rig.sensors import lens_block
@@ -199,7 +199,7 @@ def _images_of(
     pictured = {channel for _, channel in jobs}
     have = session.rig.cameras[camera].channels
     of_events = [name for name in channels if have[name].kind == "events" and name not in pictured]
-    in_events = detect(session).images if of_events else {}
+    in_events = detect_boards(session).images if of_events else {}
     seen_in_events: dict[Key, ImageDetection] = {
         (capture, channel): detection
         for channel in of_events

@@ -39,7 +39,7 @@ _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
 _LEAST_AGREEING = 5
 
 
-def detect(
+def detect_boards(
     session: Session,
     *,
     progress: Progress = silent,

@@ -25,7 +25,7 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
-from lce_rig.pipeline.detect_session import candidates_of, detect
+from lce_rig.pipeline.detect_session import candidates_of, detect_boards
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 
@@ -80,7 +80,7 @@ def measure_lidar(
     options = EstimateSettings.of(CalibrateOptions("paper"), settings)
     used, starts, of_session, scale_sigma = [], [], [], 0.0
     for k, session in enumerate(sessions):
-        detections = detect(session, progress=progress) if found is None else found[k]
+        detections = detect_boards(session, progress=progress) if found is None else found[k]
         for pair in detections.pairs:
             channel = session.rig.cameras[pair.camera].channels[pair.channel]
             if pair.lidar != name or channel.kind != "frames":

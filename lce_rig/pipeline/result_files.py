@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Calibration, Provenance, ResultFile, RigPos
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.core.rig_poses import find_rig_poses
-from lce_rig.export import export, is_export
+from lce_rig.export import is_export, write_exports
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.session.capture import MANIFEST, SAFE_NAME
@@ -130,7 +130,7 @@ class Result:
             if profile is not None:
                 write_atomically(draft / PROFILE, profile)
             if usable:
-                exported = export(
+                exported = write_exports(
                     usable, self.session.rig, draft, is_forced=force, session=self.session, findings=findings
                 )
                 files += [place / path.relative_to(draft) for path in exported]

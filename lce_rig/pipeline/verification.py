@@ -18,7 +18,7 @@ from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session, seen_by_own_lens
-from lce_rig.pipeline.detect_session import detect, event_channels, event_picture, match_sensors
+from lce_rig.pipeline.detect_session import detect_boards, event_channels, event_picture, match_sensors
 from lce_rig.pipeline.findings import OTHER_PROFILE
 from lce_rig.pipeline.result_files import (
     OVERLAYS,
@@ -156,7 +156,7 @@ def verify(
     rig, notes = with_lenses_of(session.rig, profile)
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
-    detections = detections or detect(session, progress=progress)
+    detections = detections or detect_boards(session, progress=progress)
     checks, board = [], session.rig.board.to_board()
     for c in calibrations:
         scene = SceneOpinion(0, 0) if c.is_of_peers else hear_scene(session, detections, c)

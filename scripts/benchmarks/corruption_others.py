@@ -64,7 +64,7 @@ def late_events(methods: Sequence[Method]) -> Iterator[Outcome]:
         ):
             for capture in simulate_captures(rig, n_captures=N_CAPTURES, seed=SEED, options=options):
                 session.add_capture(capture.images, capture.scans, {}, events=capture.events)
-            found = lce.detect(session, n_threads=1)
+            found = lce.detect_boards(session, n_threads=1)
         for channels in (("events",), ("events", "frames")):
             name, expected = f"rles {' + '.join(channels)}", TIME_OFFSET if late_s else NOTHING
             for method in methods:

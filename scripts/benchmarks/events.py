@@ -107,7 +107,7 @@ def _session(seed: int, n_captures: int) -> SessionRun:
             for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
                 name = session.add_capture(capture.images, capture.scans, {}, events=capture.events)
                 captures[name] = capture
-            return _assess(rig, lce.detect(session, n_threads=1), captures, truth)
+            return _assess(rig, lce.detect_boards(session, n_threads=1), captures, truth)
 
 
 def _assess(

@@ -59,7 +59,7 @@ def _bench_model(model: str, n_captures: int, folder: Path) -> None:
     found = f"{sum(is_found)} of {len(scans)}"
     took = f"{1e3 * np.median(best_s):.0f}"
     try:
-        pair = lce.calibrate(session).pairs[0]
+        pair = lce.calibrate_session(session).pairs[0]
     except lce.LceRigError as error:
         print_row(model, points, found, took, "-", "-", "-", error.what)
         return

@@ -86,4 +86,4 @@ def detect(path: Path) -> tuple[Rig, Detections]:
     from lce_rig.session import Session
 
     session = Session.open(path)
-    return session.rig, lce.detect(session)
+    return session.rig, lce.detect_boards(session)

@@ -47,7 +47,7 @@ class _Watched:
         with tempfile.TemporaryDirectory() as folder:
             recorded.collect(Path(folder) / "session")
             session = Session.open(Path(folder) / "session")
-            (c,) = lce.calibrate(session).pairs
+            (c,) = lce.calibrate_session(session).pairs
             return cls._of(session, c)
 
     @classmethod

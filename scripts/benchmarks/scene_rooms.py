@@ -56,7 +56,7 @@ class FurnishedRoom:
     @cached_property
     def detections(self) -> Detections:
         """The boards of all captures."""
-        return lce.detect(self.session, n_threads=1)
+        return lce.detect_boards(self.session, n_threads=1)
 
     def calibrate(self) -> Calibration:
         """Calibrate on the boards of all captures alone."""

@@ -45,7 +45,9 @@ def bench_sessions() -> None:
             path = Path(folder) / recorded.name
             recorded.collect(path)
             if reference is None:
-                reference = lce.calibrate(Session.open(path), options=lce.CalibrateOptions("paper")).pairs[0]
+                reference = lce.calibrate_session(
+                    Session.open(path), options=lce.CalibrateOptions("paper")
+                ).pairs[0]
             rig, detections = detect(path)
             board, lens = rig.board.to_board(), reference.intrinsics
             assert lens is not None

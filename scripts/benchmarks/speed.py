@@ -54,7 +54,7 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     seen = [finder.search_image(picture).located for picture in pictures]
     lasts = [board if isinstance(board, ImageBoard) else None for board in seen]
     yield "tracked, median", milliseconds(lambda k: finder.search_image(pictures[k], lasts[k]))
-    detections = lce.detect(session)
+    detections = lce.detect_boards(session)
     pair = detections.pairs[0]
     both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
     candidates = [

@@ -22,7 +22,7 @@ from fuzzing.report import Report
 from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import LceRigError
-from lce_rig.export import export
+from lce_rig.export import write_exports
 from lce_rig.rig import load_rig
 
 _N_CAPTURES = 8
@@ -173,7 +173,7 @@ def _misread(session: Path, folder: Path) -> list[str]:
         saved = read_result(folder / "result.json")
         with tempfile.TemporaryDirectory() as own:
             usable = [c for c in saved.pairs if c.verdict != "fail"]
-            export(usable, load_rig(session / "rig.yaml"), Path(own))
+            write_exports(usable, load_rig(session / "rig.yaml"), Path(own))
             exports = content_of(Path(own))
     except LceRigError as error:
         return [str(error)]

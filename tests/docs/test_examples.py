@@ -19,7 +19,7 @@ def simulated(tmp_path_factory):
     """Two independent sessions of one simulated rig, seven captures each."""
     folder = tmp_path_factory.mktemp("simulated")
     assert run(["simulate", "--rig", "rles", str(folder / "monday"), "--captures", "14", "--seed", "3"]) == 0
-    lce.detect(lce.Session.open(folder / "monday"))
+    lce.detect_boards(lce.Session.open(folder / "monday"))
     shutil.copytree(folder / "monday", folder / "friday")
     for capture in lce.Session.open(folder / "monday").captures:
         shutil.rmtree(folder / ("monday" if int(capture.name) % 2 else "friday") / "captures" / capture.name)
@@ -69,7 +69,7 @@ def test_example_folder_gives_a_result(workplace):
 @pytest.mark.long
 def test_two_sessions_are_compared_by_their_figures(workplace, capsys):
     for name in ("monday", "friday"):
-        lce.calibrate(name).write(report=False)
+        lce.calibrate_session(name).write(report=False)
     main_of("compare_sessions.py")("monday", "friday")
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("lidar: agree") and "davis" in lines[0]
@@ -91,7 +91,7 @@ def test_example_own_reader_gives_extrinsics(workplace, capsys):
         main_of("own_lidar.py")("rles", "folder", "own")
     own = lce.Session.open("own")
     assert len(own.captures) == 7
-    assert error_to_truth(lce.calibrate(own).pairs[0], workplace / "monday") < 0.05
+    assert error_to_truth(lce.calibrate_session(own).pairs[0], workplace / "monday") < 0.05
 
 
 @pytest.mark.long

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.export import EXPORTS, export
+from lce_rig.export import EXPORTS, write_exports
 from lce_rig.export.other_tools import fit_lens
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.profile import Mount
@@ -370,7 +370,7 @@ def outputs_case(rig_name, folder, *, model="radtan", seed=0):
         scan = Scan(lidar, 10**18, points, zeros, (np.arange(len(points)) % 16).astype(np.int16), None)
         image = Image(camera, channel, 10**18 + 5, session_image(rig, camera))
         session.add_capture([image], [scan], {})
-        export([calibration], rig, folder / "out", formats=EXPORTS, session=session)
+        write_exports([calibration], rig, folder / "out", formats=EXPORTS, session=session)
     return Case(folder / "out", rig, calibration, points.astype(np.float64), lens)
 
 

@@ -14,7 +14,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, invert, pose
-from lce_rig.export import EXPORTS, export
+from lce_rig.export import EXPORTS, write_exports
 from lce_rig.export.other_tools import fit_lens
 from lce_rig.export.robot_tree import Joint, RobotTree
 from lce_rig.export.urdf import read_robot_urdf
@@ -47,8 +47,8 @@ def body_poses():
 def test_every_format_survives_any_pose(rles, make, tmp_path, T_lidar_body):
     T_cam_lidar = invert(T_lidar_body @ T_BODY_OPTICAL)
     usual = {"extrinsics.yaml", "rles.urdf", "camera_info_davis.yaml", "static_transforms.txt"}
-    assert {path.name for path in export([make(T_cam_lidar)], rles, tmp_path)} == usual
-    export([make(T_cam_lidar)], rles, tmp_path / "others", formats=["kalibr", "autoware"])
+    assert {path.name for path in write_exports([make(T_cam_lidar)], rles, tmp_path)} == usual
+    write_exports([make(T_cam_lidar)], rles, tmp_path / "others", formats=["kalibr", "autoware"])
     import yourdfpy
 
     robot = yourdfpy.URDF.load(str(tmp_path / "rles.urdf"), load_meshes=False, build_scene_graph=True)
@@ -58,7 +58,7 @@ def test_every_format_survives_any_pose(rles, make, tmp_path, T_lidar_body):
 
 def test_extrinsics_notations_agree(rles, make, tmp_path):
     calibration = make()
-    (path,) = export([calibration], rles, tmp_path, formats=["extrinsics"])
+    (path,) = write_exports([calibration], rles, tmp_path, formats=["extrinsics"])
     (pair,) = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
     for name, wanted in (
         ("T_cam_lidar", calibration.T_cam_lidar),
@@ -83,7 +83,7 @@ def test_extrinsics_notations_agree(rles, make, tmp_path):
 
 
 def test_static_tf_ros1_equals_ros2(rles, make, tmp_path):
-    (path,) = export([make()], rles, tmp_path, formats=["static_tf"])
+    (path,) = write_exports([make()], rles, tmp_path, formats=["static_tf"])
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     # What ROS 2 is told is read back elsewhere; ROS 1 takes the same values in the same order, without names.
     ros2 = [words[5::2] for words in lines if words[:3] == ["ros2", "run", "tf2_ros"]]
@@ -105,7 +105,7 @@ def test_export_several_sensors_share_a_tree(three_sensor_rig, make, tmp_path, b
     rig = three_sensor_rig.model_copy(update={"base_frame": base})
     pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("fish", "back")]
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
-    paths = export(calibrations, rig, tmp_path)
+    paths = write_exports(calibrations, rig, tmp_path)
     assert [path.name for path in paths if path.suffix == ".urdf"] == ["trio.urdf"]
     read = read_robot_urdf(tmp_path / "trio.urdf")
     assert read.chain("fish_optical")[-1] == (base or "velodyne")
@@ -118,7 +118,7 @@ def test_export_several_sensors_share_a_tree(three_sensor_rig, make, tmp_path, b
 
 def test_export_unconnected_gives_two_urdfs(three_sensor_rig, make, tmp_path):
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
-    paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
+    paths = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
 
 
@@ -141,18 +141,18 @@ def test_frames_that_make_no_tree_are_refused(links, joints):
 
 def test_export_failed_result_is_refused(rles, make, tmp_path):
     """Exports of an earlier run are removed, other files stay."""
-    export([make()], rles, tmp_path)
+    write_exports([make()], rles, tmp_path)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     failed = make(verdict="fail", findings=(reason("translation known to 80 mm only"),))
     with pytest.raises(ResultRefusedError) as caught:
-        export([failed], rles, tmp_path)
+        write_exports([failed], rles, tmp_path)
     assert "80 mm" in caught.value.hint
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_export_forced_failure_is_marked(rles, make, tmp_path):
     failed = make(verdict="fail", findings=(reason("sigma -- 80 mm\nand more"),))
-    paths = export([failed], rles, tmp_path, formats=EXPORTS, is_forced=True)
+    paths = write_exports([failed], rles, tmp_path, formats=EXPORTS, is_forced=True)
     for path in paths:
         if path.suffix == ".mcap":
             path = path.with_name("metadata.yaml")
@@ -176,7 +176,7 @@ def test_export_forced_failure_is_marked(rles, make, tmp_path):
 )
 def test_exported_camera_files_are_read_back(rles, make, tmp_path, pattern, block):
     rig = changed(rles, **{f"cameras__davis__intrinsics__{key}": value for key, value in block.items()})
-    export([make()], rig, tmp_path, formats=["camera_info", "kalibr", "fast_livo2", "opencv"])
+    write_exports([make()], rig, tmp_path, formats=["camera_info", "kalibr", "fast_livo2", "opencv"])
     (path,) = tmp_path.glob(pattern)
     lens, _ = read_cameras(path).intrinsics()
     given = rig.cameras["davis"].to_intrinsics()
@@ -202,14 +202,14 @@ def test_a_lens_of_opencv_is_read(version, extra, model, tmp_path):
 @pytest.mark.parametrize("name", sorted(EXPORTS))
 def test_export_infinite_pose_is_refused(name, rles, make, tmp_path):
     with pytest.raises(ResultRefusedError):
-        export([make(np.full((4, 4), np.nan))], rles, tmp_path, formats=[name])
+        write_exports([make(np.full((4, 4), np.nan))], rles, tmp_path, formats=[name])
     assert not list(tmp_path.iterdir())
 
 
 def test_a_result_of_another_rig_is_refused(rles, make, tmp_path):
     for change in ({"camera": "cam"}, {"lidar": "other"}, {"channels": ("depth",)}):
         with pytest.raises(LceRigError):
-            export([make(**change)], rles, tmp_path)
+            write_exports([make(**change)], rles, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -217,7 +217,7 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
     findings = []
-    files = export(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"], findings=findings)
+    files = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"], findings=findings)
     chain = yaml.safe_load(files[0].read_text(encoding="utf-8"))
     assert [block["distortion_model"] for block in chain.values()] == ["radtan", "radtan", "equidistant"]
     for index in (1, 2):

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ResultRefusedError
 from lce_rig.core.geometry import perturb
-from lce_rig.export import EXPORTS, ExportJob, export, is_export, remove_exports, usual_formats
+from lce_rig.export import EXPORTS, ExportJob, is_export, remove_exports, usual_formats, write_exports
 from lce_rig.export.coloured_cloud import coloured
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import OutputFormat
@@ -60,7 +60,7 @@ def test_refused_export_leaves_earlier_files(case, tmp_path):
     shutil.copytree(case.folder, folder)
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     with pytest.raises(ResultRefusedError):
-        export([replace(case.calibration, verdict="fail")], case.rig, folder)
+        write_exports([replace(case.calibration, verdict="fail")], case.rig, folder)
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
 
 

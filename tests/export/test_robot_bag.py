@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
 from lce_rig.core.geometry import Array, pose
-from lce_rig.export import export
+from lce_rig.export import write_exports
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.urdf import read_robot, read_robot_bag
 from lce_rig.export.writing import R_BODY_OPTICAL
@@ -95,7 +95,7 @@ def test_robot_bag_of_any_kind_fits_outputs(rles, make, tmp_path, name):
     np.testing.assert_allclose(
         joints["velodyne"].T_parent_child, np.linalg.inv(placed(0.5)) @ T_base_lidar, atol=1e-9
     )
-    export([make()], rles, tmp_path / "out", formats=["static_tf", "urdf"], robot=robot)
+    write_exports([make()], rles, tmp_path / "out", formats=["static_tf", "urdf"], robot=robot)
     lines = (tmp_path / "out" / "static_transforms.txt").read_text().splitlines()
     published = [line.split()[-4:] for line in lines if line.startswith("ros2 run")]
     assert published == [["--frame-id", "mast", "--child-frame-id", "velodyne"]]
@@ -164,7 +164,7 @@ def test_autoware_kit_keeps_robot_frames(rles, make, tmp_path):
         ("sensor_kit_base_link", "davis_link", placed(0.3)),
     ]
     read = read_robot_bag(write_bag(tmp_path / "robot_mcap", [robot]))
-    paths = export([make()], rles, tmp_path / "out", formats=["autoware"], robot=read)
+    paths = write_exports([make()], rles, tmp_path / "out", formats=["autoware"], robot=read)
     kit, base = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in paths)
 
     def read_pose(block):

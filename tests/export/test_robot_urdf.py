@@ -12,7 +12,7 @@ from yourdfpy import URDF
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import exp_so3, pose
-from lce_rig.export import export
+from lce_rig.export import write_exports
 from lce_rig.export.robot_tree import fit_tree
 from lce_rig.export.urdf import read_robot_urdf, write_into_urdf
 from lce_rig.rig.profile import Mount
@@ -148,7 +148,7 @@ def test_urdf_sensor_nearest_root_stays(three_sensor_rig, make, tmp_path):
 def test_mount_is_the_root_of_outputs(rles, make, tmp_path):
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
-    export([make()], rig, tmp_path)
+    write_exports([make()], rig, tmp_path)
     read = read_robot_urdf(tmp_path / f"{rig.name}.urdf")
     assert read.chain("velodyne")[-1] == "base_link"
     np.testing.assert_allclose(read.find_pose("base_link", "davis_link"), mount.to_matrix())

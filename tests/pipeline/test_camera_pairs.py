@@ -7,7 +7,7 @@ from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.core.rig_poses import find_rig_poses
 from lce_rig.detect.detection import Detections
-from lce_rig.export import export
+from lce_rig.export import write_exports
 from lce_rig.pipeline.calibration import calibrate_detections
 from tests.calibrate.boards import in_use
 from tests.calibrate.four_sensors import ON_FRONT, between, make_rig, simulate
@@ -47,7 +47,7 @@ def test_two_cameras_result_reads_back_and_exports(alone, tmp_path):
     (back,) = read_result(tmp_path / "result.json").pairs
     assert back.is_of_cameras and back.lidar_intrinsics == c.lidar_intrinsics
     assert np.array_equal(back.T_cam_lidar, c.T_cam_lidar)
-    export([back], make_rig(BOTH), tmp_path, formats=["extrinsics", "urdf", "kalibr", "static_tf"])
+    write_exports([back], make_rig(BOTH), tmp_path, formats=["extrinsics", "urdf", "kalibr", "static_tf"])
     chain = (tmp_path / "camchain.yaml").read_text()
     assert "T_cn_cnm1" in chain and chain.count("camera_model") == 2
     assert '<child link="right_link"/>' in (tmp_path / "four.urdf").read_text()

@@ -5,7 +5,7 @@ import numpy as np
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.detect_session import detect, unlike_models
+from lce_rig.pipeline.detect_session import detect_boards, unlike_models
 from lce_rig.session import Session
 
 
@@ -25,7 +25,7 @@ def room(rig, every):
 def refusal_of_room(rig, path, every):
     with Session.create(path, rig) as session:
         name = session.add_capture([], [room(rig, every)], {})
-        found = detect(session).lidars["lidar"][name]
+        found = detect_boards(session).lidars["lidar"][name]
     assert isinstance(found, Refusal)
     return found
 
@@ -46,4 +46,4 @@ def test_unlike_models_boards_hide_nothing(rig, tmp_path):
         # As if the board had been found in it.
         (finding,) = unlike_models(session, Detections({}, {"lidar": {name: []}}))
         assert finding.code == "recording.rings_skipped" and finding.figures["n_seen"] <= 8
-        assert unlike_models(session, detect(session)) == []
+        assert unlike_models(session, detect_boards(session)) == []

@@ -54,7 +54,7 @@ def session_of(folder, events, profile=PROFILE, **more):
 
 
 def found_in(session, **more):
-    return lce.detect(session, **more).images["dvs", "events"]["000000"]
+    return lce.detect_boards(session, **more).images["dvs", "events"]["000000"]
 
 
 @pytest.fixture(scope="module")

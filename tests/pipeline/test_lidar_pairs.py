@@ -11,7 +11,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
-from lce_rig.export import ExportJob, export
+from lce_rig.export import ExportJob, write_exports
 from lce_rig.judge.sensor_pairs import Loop, loop_findings
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
@@ -162,7 +162,7 @@ def test_a_result_of_lidars_is_read_back_and_exported(tmp_path):
     (back,) = read_result(path).pairs
     assert back.is_of_lidars
     assert np.array_equal(back.T_cam_lidar, result.T_cam_lidar)
-    files = export([back], rig, tmp_path / "out", is_forced=True)
+    files = write_exports([back], rig, tmp_path / "out", is_forced=True)
     assert {file.name for file in files} == {"extrinsics.yaml", "pair.urdf", "static_transforms.txt"}
     (tree,) = ExportJob([back], rig, tmp_path).trees
     (joint,) = tree.above.values()

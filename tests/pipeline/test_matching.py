@@ -7,7 +7,7 @@ import pytest
 import lce_rig as lce
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.pipeline.detect_session import detect, expected_poses, match_sensors
+from lce_rig.pipeline.detect_session import detect_boards, expected_poses, match_sensors
 
 RIGS = Path(__file__).parents[1] / "rigs"
 
@@ -21,7 +21,7 @@ def session(recordings, tmp_path_factory):
 @pytest.mark.dataset
 @pytest.mark.long
 def test_hidden_boards_are_found_by_images(session):
-    detections = detect(session)
+    detections = detect_boards(session)
     pair = Pair("cam", "frames", "lidar")
     assert len(detections.captures(pair)) == 11
     assert match_sensors(session.rig, detections, pair)[0] == {}
@@ -32,7 +32,7 @@ def test_hidden_boards_are_found_by_images(session):
 @pytest.mark.dataset
 @pytest.mark.long
 def test_predict_needs_captures_and_image(session):
-    found = detect(session)
+    found = detect_boards(session)
     names = found.captures(Pair("cam", "frames", "lidar"))
     refusal = Refusal("lidar.no_returns", figures={"n_points": 0, "min_range_m": 0.4})
     scans = {**found.lidars["lidar"], names[0]: refusal, names[1]: refusal}

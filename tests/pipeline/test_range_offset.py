@@ -77,7 +77,7 @@ def test_detections_belong_to_a_range_offset(session):
     assert detection_digest(SOUND) != detection_digest(LONG)
 
     def distances_m():
-        found = lce.detect(session).lidars["lidar"]
+        found = lce.detect_boards(session).lidars["lidar"]
         return {name: boards[0].quality.distance_m for name, boards in found.items()}
 
     before = distances_m()
@@ -91,9 +91,9 @@ def test_detections_belong_to_a_range_offset(session):
 def test_calibrate_with_range_offset_recovers_truth(tmp_path):
     truth = truth_extrinsics(LONG, SEED)["cam", "lidar"]
     with fill(tmp_path / "session", simulated(12)) as session:
-        without = lce.calibrate(session).of("cam")
+        without = lce.calibrate_session(session).of("cam")
         session.adopt(LONG)
-        result = lce.calibrate(session).of("cam")
+        result = lce.calibrate_session(session).of("cam")
     error = difference(truth, result.T_cam_lidar)
     assert np.sqrt(error @ np.linalg.solve(result.cov, error) / 6) < 2.5
     assert np.linalg.norm(error[:3]) < 0.012

@@ -12,7 +12,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.judge.scene_drift import watch_scene
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import load_rig
@@ -60,7 +60,7 @@ def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, ca
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
     assert pair["scene"]["n_edges"] > 300 and pair["scene"]["state"] != "changed"
     session = Session.open(tmp_path / "room")
-    assert hear_scene(session, detect(session), seen.truth).state in ("agrees", "unknown")
+    assert hear_scene(session, detect_boards(session), seen.truth).state in ("agrees", "unknown")
 
 
 KITTI = Path(__file__).parents[1] / "rigs" / "kitti.yaml"

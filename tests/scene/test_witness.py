@@ -11,7 +11,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import MOTIONS, ChannelResult, SceneOpinion, read_result
 from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.judge.verdict import with_opinion
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.verification import verify
 from lce_rig.pipeline.witness import hear_scene, scene_views
 from lce_rig.session import Session
@@ -22,7 +22,7 @@ from tests.saved_results import write_result
 def heard(room):
     """The session, and the boards detected in it."""
     session = Session.open(room)
-    return session, detect(session)
+    return session, detect_boards(session)
 
 
 def turned(calibration, degrees):
@@ -95,14 +95,14 @@ def test_scene_without_features_changes_no_verdict(seen, tmp_path):
         return [replace(image, pixels=np.full_like(image.pixels, 90))]
 
     session = session_of(seen, tmp_path / "even", even)
-    opinion = hear_scene(session, detect(session), turned(seen.truth, 1.5))
+    opinion = hear_scene(session, detect_boards(session), turned(seen.truth, 1.5))
     assert opinion.state == "unknown" and opinion.n_captures == 4
     assert with_opinion(seen.truth, opinion).verdict == "pass"
 
 
 def test_without_frames_it_cannot_tell(seen, tmp_path):
     session = session_of(seen, tmp_path / "blind", lambda capture: [])
-    opinion = hear_scene(session, detect(session), seen.truth)
+    opinion = hear_scene(session, detect_boards(session), seen.truth)
     assert (opinion.n_captures, opinion.n_edges, opinion.state) == (0, 0, "unknown")
 
 
@@ -112,7 +112,7 @@ def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path):
     session = Session.open(copy)
     file = session.captures[1].path / "cam.frames.png"
     file.write_bytes(file.read_bytes()[:999])
-    opinion = hear_scene(session, detect(session), seen.truth)
+    opinion = hear_scene(session, detect_boards(session), seen.truth)
     assert opinion.n_captures == 3 and opinion.state != "contradicts"
 
 
