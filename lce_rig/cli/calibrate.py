@@ -19,7 +19,7 @@ from lce_rig.cli.options import (
     split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
-from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, RigPoses
+from lce_rig.core.calibration import BY_SCENE, DEFAULT_METHOD, Calibration, Method, Metrics, RigPoses
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError, join_shortages
 from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import sizes
@@ -29,7 +29,6 @@ from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
 from lce_rig.pipeline.detect_session import unlike_models
 from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
-from lce_rig.pipeline.scene_calibration import METHOD as BY_SCENE
 from lce_rig.pipeline.scene_calibration import calibrate_scene
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -65,7 +64,7 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
     by_axis = (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm"))
     for title, values, digits, unit in (
-        by_axis if is_by_axis and (c.verdict == "pass" or c.method == BY_SCENE) else ()
+        by_axis if is_by_axis and (c.verdict == "pass" or not c.is_with_board) else ()
     ):
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
@@ -399,7 +398,7 @@ def _parts(
     earlier = list(dict.fromkeys(told[each.text] for each in causes if each.text in told))
     fresh = [each for each in causes if each.text not in told]
     told |= {each.text: pair for each in fresh}
-    used = f"{len(c.captures_used)} of {c.n_captures} {'views' if c.method == BY_SCENE else 'captures'} used"
+    used = f"{len(c.captures_used)} of {c.n_captures} {'captures' if c.is_with_board else 'views'} used"
     yield f"[bold]{pair}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
     # A line counts those that are not shown.

@@ -99,6 +99,8 @@ DEFAULT_METHOD: Method = "ml"
 """How extrinsics are estimated: the joint maximum likelihood, or Algorithm 1 of LCE-Calib."""
 
 Verdict = Literal["pass", "marginal", "fail"]
+BY_SCENE = "scene"
+"""Method of extrinsics that a scene determined, without a board."""
 
 
 @dataclass(frozen=True)
@@ -388,6 +390,11 @@ class Calibration:
     board_distances_m: tuple[Size, ...] = ()
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)
+
+    @property
+    def is_with_board(self) -> bool:
+        """Whether captures of a board determined the extrinsics, not a scene alone."""
+        return self.method != BY_SCENE
 
     @property
     def is_of_lidars(self) -> bool:

@@ -5,7 +5,6 @@ LiDAR -> checks, verdict, overlays
 """
 
 import math
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.core.calibration import MOTIONS, Calibration, Certificate, Metrics
+from lce_rig.core.calibration import BY_SCENE, MOTIONS, Calibration, Certificate, Metrics
 from lce_rig.core.data import Image, Sample, Scan
 from lce_rig.core.errors import (
     NotEnoughDataError,
@@ -57,8 +56,8 @@ from lce_rig.show.overlays.canvas import write_picture
 from lce_rig.show.overlays.overlay import draw_edges
 from lce_rig.timing.scan_pairing import pair_by_time, rig_time_ns
 
-METHOD, OVERLAYS = "scene", "scene"
-"""How result.json names the method; the session's folder of overlays."""
+OVERLAYS = "scene"
+"""Folder of the overlays in the session."""
 _MOST_VIEWS = 16  # More views of one drive add time, and little information.
 _DARK = 40  # Grey value that 1 % of the pixels exceed in the brightest view: below it, images are dark.
 _SCENE = "scene"  # Key of a capture's data: its place in the recording.
@@ -112,7 +111,9 @@ class SceneResult:
             SessionError: a file cannot be written.
         """
         folder, rig = self.result.session.path / OVERLAYS, self.result.session.rig
-        shutil.rmtree(folder, ignore_errors=True)
+        for each in self.drawn:
+            for earlier in folder.glob(f"{each.camera}_{each.lidar}_*.png"):
+                earlier.unlink(missing_ok=True)
         files = []
         for each in self.drawn:
             lens = rig.cameras[each.camera].to_intrinsics()
@@ -353,7 +354,7 @@ def calibrate_pair(
         metrics=Metrics(math.nan, math.nan, math.nan),
         certificate=Certificate(False, math.inf),
         verdict="marginal",
-        method=METHOD,
+        method=BY_SCENE,
         uncertainty=point_uncertainties(estimate.T_cam_lidar, estimate.cov, lens),
         intrinsics=lens,
     )

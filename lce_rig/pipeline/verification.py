@@ -177,6 +177,11 @@ def verify(
                     if watched is not None and watched.joint.is_changed:
                         check = replace(check, findings=(watched.joint.finding, *check.findings))
                 checks.append(check)
+    if all(check.metrics is None for check in checks) and any(not c.is_with_board for c in calibrations):
+        raise SessionError(
+            f"{session.path}: the result was made without a board, and no capture shows one",
+            "Check it on another drive: `lce-rig drift --result FILE RECORDING`.",
+        )
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")

@@ -101,6 +101,14 @@ def test_folder_gives_result_exports_and_overlays(drive, tmp_path, capsys):
     assert len(pictures) == 3 and cv2.imread(str(pictures[0])) is not None
 
 
+def test_verify_without_board_advises_drift(drive, tmp_path, capsys):
+    words = [str(word) for word in ("--scene", drive, "--rig", tmp_path / "mine.yaml", tmp_path / "out")]
+    (tmp_path / "mine.yaml").write_text(dump_rig(RIG))
+    assert run(["calibrate", *words]) in (0, 7)
+    assert run(["verify", str(tmp_path / "out")]) == 4
+    assert "lce-rig drift" in capsys.readouterr().err
+
+
 def test_folder_again_keeps_captures(drive, tmp_path):
     words = ["calibrate", "--scene", str(drive), "--rig", profile(tmp_path), str(tmp_path / "out")]
     assert run(words) == 0 and run(words) == 0
