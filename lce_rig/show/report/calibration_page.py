@@ -27,7 +27,7 @@ from lce_rig.judge.findings import advice_of
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.overlays.canvas import accumulated
-from lce_rig.show.page import render, style
+from lce_rig.show.page import render
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.tables import result_tables, rig_table, scene_words
@@ -62,8 +62,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
     has_folders = sum(max(len(c.channels), 1) for c in file.pairs) > 1
     pairs = []
     for k, c in enumerate(file.pairs):
-        with style(f"pair-{k}"):
-            pair = _pair(session.rig, c, f"pair-{k}")
+        pair = _pair(session.rig, c, f"pair-{k}")
         for capture in pair["captures"]:
             capture["overlays"] = _overlays(session.capture(capture["name"]), c, overlays, has_folders)
         # As many of each camera, so that the whole page stays small.
@@ -149,13 +148,20 @@ def _drawings(
     if evidence is None or lens is None:
         return {}
     links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
-    return {
-        "in_image": drawings.draw_in_image(evidence, board, lens, links),
-        "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-        "by_ring": drawings.draw_by_ring(evidence),
-        "by_range": drawings.draw_by_range(evidence, links),
-        "corners": drawings.draw_corners(evidence, lens),
+    drawn = {
+        "in_image": (
+            drawings.draw_in_image(evidence, board, lens, links),
+            "Outlines of the boards in the image",
+        ),
+        "from_above": (
+            drawings.draw_from_above(c, evidence, board, lens, links),
+            "Boards around the LiDAR, from above",
+        ),
+        "by_ring": (drawings.draw_by_ring(evidence), "Residuals by ring"),
+        "by_range": (drawings.draw_by_range(evidence, links), "Residuals by range"),
+        "corners": (drawings.draw_corners(evidence, lens), "Residuals of the corners in the image"),
     }
+    return {name: axes.markup(label, f"{anchor}-{name}") for name, (axes, label) in drawn.items()}
 
 
 def _statement(c: Calibration) -> str:
