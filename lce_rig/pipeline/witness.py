@@ -10,12 +10,18 @@ from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
+from lce_rig.show.overlays.canvas import Thumbnails, reduced
 
 _MOST_CAPTURES = 6
 """More captures of one place add time, mainly for decoding images, and no information."""
 
 
-def hear_scene(session: Session, detections: Detections, calibration: Calibration) -> SceneOpinion:
+def hear_scene(
+    session: Session,
+    detections: Detections,
+    calibration: Calibration,
+    thumbnails: Thumbnails | None = None,
+) -> SceneOpinion:
     """Compare extrinsics with the edges of the scene in some captures of a session, spread over it.
 
     Damaged captures are skipped. A camera without frames has no opinion.
@@ -24,14 +30,17 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         session: any session of the rig.
         detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
+        thumbnails: receives the images that were decoded.
     """
     c = calibration
-    views = scene_views(session, detections, c)
+    views = scene_views(session, detections, c, thumbnails)
     drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov)
     return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.is_compared else ())
 
 
-def scene_views(session: Session, detections: Detections, c: Calibration) -> list[SceneView]:
+def scene_views(
+    session: Session, detections: Detections, c: Calibration, thumbnails: Thumbnails | None = None
+) -> list[SceneView]:
     """Find the edges of the scene without those at the board; arguments as of `hear_scene`."""
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
@@ -41,6 +50,8 @@ def scene_views(session: Session, detections: Detections, c: Calibration) -> lis
         with suppress(SessionError):
             capture = session.capture(name)
             image, scan = capture.image(c.camera, channel), session.scan(capture, c.lidar)
+            if thumbnails is not None:
+                thumbnails[name, c.camera, channel] = reduced(image.pixels)
             view = build_view(session.rig, c, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, c))
     return views
