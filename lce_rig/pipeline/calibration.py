@@ -66,6 +66,7 @@ from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.show.overlays.canvas import Thumbnails
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +173,7 @@ def calibrate_session(
         progress=progress,
     )
     begin(progress, "comparing with the scene")
-    judged = []
+    judged, thumbnails = [], Thumbnails()
     for c in calibrations:
         truth = None if reference is None else reference.of(c.camera, c.lidar)
         if truth is not None:
@@ -181,12 +182,12 @@ def calibrate_session(
         if c.is_of_peers:
             judged.append(c)
             continue
-        c = with_opinion(c, hear_scene(session, detections, c))
+        c = with_opinion(c, hear_scene(session, detections, c, thumbnails))
         if lacks_captures(c.findings):
             held = boards_in(detections, c.camera, c.lidar, c.captures_used)
             c = replace(c, findings=(*c.findings, *plan_captures(session.rig, c.camera, c.lidar, held, c)))
         judged.append(c)
-    return Result(session, tuple(judged), tuple(shortages))
+    return Result(session, tuple(judged), tuple(shortages), thumbnails)
 
 
 def calibrate_detections(

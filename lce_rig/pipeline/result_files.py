@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from lce_rig.session.capture import MANIFEST, SAFE_NAME
 from lce_rig.session.durable import check_folder, copy_over, replacing, write_atomically
 from lce_rig.session.provenance import provenance_of
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
+from lce_rig.show.overlays.canvas import Thumbnails
 
 RESULT, REPORT, OVERLAYS, PREVIOUS = "result.json", "report.html", "overlays", "previous"
 CURRENT = "current"
@@ -54,11 +55,13 @@ class Result:
         session: the source of the captures.
         pairs: one for each calibrated camera and LiDAR.
         shortages: for each other camera and LiDAR with captures, why it has no result.
+        thumbnails: images that were decoded for the result; the report decodes the others.
     """
 
     session: Session
     pairs: tuple[Calibration, ...]
     shortages: tuple[Finding, ...] = ()
+    thumbnails: Thumbnails = field(default_factory=Thumbnails)
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
@@ -153,7 +156,8 @@ class Result:
         file = self.file()
         text = file.text()
         place = result_folder(self.session.path, name, is_new=True)
-        page = report_page(self.session, file, OVERLAYS, has_previous=bool(_usable(place / PREVIOUS)))
+        has_previous = bool(_usable(place / PREVIOUS))
+        page = report_page(self.session, file, OVERLAYS, self.thumbnails, has_previous=has_previous)
 
         def finish(earlier: Path, draft: Path) -> None:
             if result_content(earlier) != text.encode():

@@ -9,12 +9,18 @@ from lce_rig.judge.scene_drift import watch_scene
 from lce_rig.scene.outline_score import OutlineView
 from lce_rig.scene.views import build_view, evenly, without_board, without_movers
 from lce_rig.session import Session
+from lce_rig.show.overlays.canvas import Thumbnails, reduced
 
 _MOST_CAPTURES = 6
 """More captures of one place add time, mainly for decoding images, and no information."""
 
 
-def hear_scene(session: Session, detections: Detections, calibration: Calibration) -> SceneOpinion:
+def hear_scene(
+    session: Session,
+    detections: Detections,
+    calibration: Calibration,
+    thumbnails: Thumbnails | None = None,
+) -> SceneOpinion:
     """Compare extrinsics with the edges of the scene in some captures of a session, spread over it.
 
     Damaged captures are skipped. A camera without frames has no opinion.
@@ -23,13 +29,16 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         session: any session of the rig.
         detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
+        thumbnails: receives the images that were decoded.
     """
     c = calibration
-    views = scene_views(session, detections, c)
+    views = scene_views(session, detections, c, thumbnails)
     return watch_scene(without_movers(views), session.rig.lens_of(c), c).opinion
 
 
-def scene_views(session: Session, detections: Detections, c: Calibration) -> list[OutlineView]:
+def scene_views(
+    session: Session, detections: Detections, c: Calibration, thumbnails: Thumbnails | None = None
+) -> list[OutlineView]:
     """Find the edges of the scene without those at the board; arguments as of `hear_scene`."""
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
@@ -39,6 +48,8 @@ def scene_views(session: Session, detections: Detections, c: Calibration) -> lis
         with suppress(SessionError):
             capture = session.capture(name)
             image, scan = capture.image(c.camera, channel), session.scan(capture, c.lidar)
+            if thumbnails is not None:
+                thumbnails[name, c.camera, channel] = reduced(image.pixels)
             view = build_view(session.rig, c, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, c))
     return views

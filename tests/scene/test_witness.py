@@ -15,6 +15,7 @@ from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.verification import verify
 from lce_rig.pipeline.witness import hear_scene, scene_views
 from lce_rig.session import Session
+from lce_rig.show.overlays.canvas import reduced
 from tests.saved_results import write_result
 
 
@@ -80,6 +81,17 @@ def test_the_board_is_left_out(heard, seen):
         on_board = transform(invert(capture.T_lidar_board["lidar"]), view.outlines.points)
         is_near = np.all(np.abs(on_board) < [*(0.5 * size_m + 0.03), 0.1], axis=1)
         assert len(view.outlines) > 20 and not is_near.any()
+
+
+def test_thumbnails_are_kept_of_every_image_decoded(heard, seen):
+    session, detections = heard
+    thumbnails = {}
+    views = scene_views(session, detections, seen.truth, thumbnails)
+    (camera,) = session.rig.cameras
+    assert list(thumbnails) == [(view.capture, camera, "frames") for view in views]
+    for (name, *_), kept in thumbnails.items():
+        expected = reduced(session.capture(name).image(camera, "frames").pixels)
+        assert np.array_equal(kept.pixels, expected.pixels) and kept.width_px == expected.width_px
 
 
 def session_of(seen, path, images_of):

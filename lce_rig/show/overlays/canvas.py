@@ -1,7 +1,7 @@
 """Anti-aliased marks and text on BGR images, and their files; sizes follow the image's width."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,23 @@ from lce_rig.session.durable import write_atomically
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
+
+
+class Thumbnail(NamedTuple):
+    """A reduced image.
+
+    Attributes:
+        pixels: (h, w) grey or (h, w, 3) BGR.
+        width_px: of the image.
+    """
+
+    pixels: Picture
+    width_px: int
+
+
+# By capture, camera and channel.
+Thumbnails = dict[tuple[str, str, str], Thumbnail]
+_THUMBNAIL_PX = 320
 
 # BGR. The marks also differ in lightness and shape, so that they can be distinguished without hue; magenta is
 # not in the turbo scale.
@@ -40,6 +57,15 @@ def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
     if factor > 1:
         bgr = cv2.resize(bgr, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
     return np.asarray(bgr, dtype=np.uint8), factor
+
+
+def reduced(pixels: Picture) -> Thumbnail:
+    """Shrink an image to at most 320 px."""
+    height, width = pixels.shape[:2]
+    scale = min(1.0, _THUMBNAIL_PX / width, _THUMBNAIL_PX / height)
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return Thumbnail(np.asarray(small, dtype=np.uint8), width)
 
 
 def show_image(axes: Any, pixels: Picture) -> None:

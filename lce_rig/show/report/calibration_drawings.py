@@ -1,11 +1,9 @@
 """Residuals of a result's boards, point by point, and their drawings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.plane_and_ends import extract_features, plane_residuals
@@ -18,7 +16,8 @@ from lce_rig.core.phrasing import significant
 from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
-from lce_rig.show.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
+from lce_rig.show import svg
+from lce_rig.show.svg import BLUE, FAINT, INK, ORANGE, QUIET, Axes
 
 # Cells along the width of the image, and corners that one needs.
 _CELLS, _MIN_IN_CELL = 14, 5
@@ -75,120 +74,118 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     )
 
 
-_LINE = 0.8
+# Heights of drawings: square ones, and those of residuals.
+_SQUARE, _LOW = svg.WIDTH, 173.0
 
 
-def _image_axes(lens: Intrinsics) -> tuple[Any, Any]:
-    """Start a figure with axes as the camera's image, pixels, v down."""
-    left_in, right_in, bottom_in, top_in = 0.42, 0.1, 0.42, 0.25
-    image_in = (WIDTH_IN - left_in - right_in) * lens.height_px / lens.width_px
-    figure, (axes,) = new_axes(
-        image_in + bottom_in + top_in, left_in=left_in, right_in=right_in, bottom_in=bottom_in, top_in=top_in
+def _image_axes(lens: Intrinsics) -> Axes:
+    """Start a drawing with axes as the camera's image, pixels, v down."""
+    width = svg.WIDTH - svg.LEFT - svg.RIGHT
+    return Axes(
+        svg.TOP + width * lens.height_px / lens.width_px + svg.BOTTOM,
+        (-0.5, lens.width_px - 0.5),
+        (lens.height_px - 0.5, -0.5),
+        x_label="u, px",
+        y_label="v, px",
+        is_framed=True,
     )
-    axes.set_xlim(-0.5, lens.width_px - 0.5)
-    axes.set_ylim(lens.height_px - 0.5, -0.5)
-    axes.set_xlabel("u, px")
-    axes.set_title("v, px")
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-    return figure, axes
 
 
-def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]) -> Markup:
+def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]) -> Axes:
     """Draw the outline of every board into the plane of the image."""
-    figure, axes = _image_axes(lens)
+    axes = _image_axes(lens)
     outlines = [outline_px(o.image.T_cam_board, board, lens) for o in evidence.observations]
-    alpha = float(np.clip(4 / len(outlines), 0.07, 0.3))
+    opacity = float(np.clip(4 / len(outlines), 0.07, 0.3))
     visible = [outline[np.isfinite(outline).all(axis=1)][::6] for outline in outlines]
-    _add_shapes(axes, visible, [links[o.capture] for o in evidence.observations], alpha)
-    return drawing(figure, "Outlines of the boards in the image")
+    axes.polygons(visible, BLUE, opacity=opacity, links=[links[o.capture] for o in evidence.observations])
+    return axes
 
 
 def draw_from_above(
     calibration: Calibration, evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]
-) -> Markup:
+) -> Axes:
     """Draw the plates about the LiDAR as seen from above, with the camera's field of view."""
     # Left is +y of the LiDAR, up is +x.
     plates = [transform(o.lidar.T_lidar_board, board.outline())[:, 1::-1] for o in evidence.observations]
     shown = np.concatenate([*plates, np.zeros((1, 2))])
     far_m = float(np.linalg.norm(shown, axis=1).max())
-    figure, (axes,) = new_axes(WIDTH_IN)
+    low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
+    axes = Axes(
+        _SQUARE,
+        (high[0], low[0]),
+        (low[1], high[1]),
+        x_label="left of the LiDAR, m",
+        y_label="ahead, m",
+        grid="xy",
+        is_equal=True,
+    )
     # The rays through the middles of the image's left and right borders.
     T_lidar_cam, middle = invert(calibration.T_cam_lidar), (lens.height_px - 1) / 2
     rays = lens.unproject(np.array([[0.0, middle], [lens.width_px - 1.0, middle]]))
+    rays = rays[np.isfinite(rays).all(axis=1)]
     start = T_lidar_cam[:3, 3]
-    for ray in rays[np.isfinite(rays).all(axis=1)]:
-        end = start + 2 * far_m * T_lidar_cam[:3, :3] @ ray
-        axes.plot([start[1], end[1]], [start[0], end[0]], color=ORANGE, linewidth=_LINE)
-    axes.plot(start[1], start[0], "s", color=ORANGE, markersize=3)
-    _add_shapes(axes, plates, [links[o.capture] for o in evidence.observations], 0.5)
-    axes.plot(0, 0, "o", color=INK, markersize=4)
-    low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
-    axes.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
-    axes.set_aspect("equal", adjustable="box")
-    axes.set_xlabel("left of the LiDAR, m")
-    axes.set_title("ahead, m")
-    axes.grid()
-    return drawing(figure, "Boards around the LiDAR, from above")
+    ends = start + 2 * far_m * rays @ T_lidar_cam[:3, :3].T
+    axes.lines(np.tile(start[1::-1], (len(rays), 1)), ends[:, 1::-1], ORANGE)
+    axes.dots(start[None, 1::-1], ORANGE, size=4, shape="square")
+    axes.polygons(plates, BLUE, opacity=0.5, links=[links[o.capture] for o in evidence.observations])
+    axes.dots(np.zeros((1, 2)), INK, size=5)
+    return axes
 
 
-def _add_shapes(axes: Any, shapes: Sequence[Array], links: list[str], alpha: float) -> None:
-    """Add polygons (N, 2), each a link."""
-    from matplotlib.collections import PolyCollection
-
-    drawn = PolyCollection(shapes, facecolors=BLUE, edgecolors=BLUE, alpha=alpha, linewidths=_LINE)
-    drawn.set_urls(links)
-    axes.add_collection(drawn, autolim=False)
-
-
-def draw_by_ring(evidence: Evidence) -> Markup:
+def draw_by_ring(evidence: Evidence) -> Axes:
     """Draw how far each laser ring's points lie behind the camera's board planes on average."""
-    rings = np.unique(evidence.ring)
+    rings = np.unique(evidence.ring).astype(np.float64)
     behind_mm = [1000 * evidence.plane_m[evidence.ring == ring] for ring in rings]
-    figure, (axes,) = new_axes(2.4)
-    _zero(axes)
-    axes.errorbar(
-        rings, [values.mean() for values in behind_mm], [values.std() for values in behind_mm],
-        fmt="o", color=BLUE, ecolor=FAINT, markersize=4, elinewidth=1.2,
-    )  # fmt: skip
-    axes.set_xlabel("ring, as the scan numbers it")
-    axes.set_title("behind the plane, mm")
-    return drawing(figure, "Residuals by ring")
+    mean_mm = np.array([values.mean() for values in behind_mm])
+    spread_mm = np.array([values.std() for values in behind_mm])
+    # Few rings still have whole numbers at their ticks.
+    axes = _residual_axes(
+        svg.padded(rings, least=2.5), rings, mean_mm, spread_mm, "ring, as the scan numbers it"
+    )
+    axes.dots(np.stack([rings, mean_mm], axis=1), BLUE, size=5)
+    return axes
 
 
-def draw_by_range(evidence: Evidence, links: Mapping[str, str]) -> Markup:
+def draw_by_range(evidence: Evidence, links: Mapping[str, str]) -> Axes:
     """Draw how far each board lies behind the camera's plane by its distance from the LiDAR."""
     n = len(evidence.observations)
     counts = np.bincount(evidence.capture, minlength=n)
     mean_mm = 1000 * np.bincount(evidence.capture, evidence.plane_m, n) / counts
     rms_mm = 1000 * np.sqrt(np.bincount(evidence.capture, evidence.plane_m**2, n) / counts)
     spread_mm = np.sqrt(np.maximum(rms_mm**2 - mean_mm**2, 0))
-    figure, (axes,) = new_axes(2.4)
-    _zero(axes)
-    axes.errorbar(evidence.range_m, mean_mm, spread_mm, fmt="none", ecolor=FAINT, elinewidth=1.2)
-    points = axes.scatter(evidence.range_m, mean_mm, s=20, color=BLUE, zorder=3, linewidths=0)
-    points.set_urls([links[o.capture] for o in evidence.observations])
-    axes.set_xlim(0, 1.05 * float(evidence.range_m.max()))
-    axes.set_xlabel("distance from the LiDAR, m")
-    axes.set_title("behind the plane, mm")
-    return drawing(figure, "Residuals by range")
+    x_limits = 0.0, 1.05 * float(evidence.range_m.max())
+    axes = _residual_axes(x_limits, evidence.range_m, mean_mm, spread_mm, "distance from the LiDAR, m")
+    axes.linked_dots(
+        np.stack([evidence.range_m, mean_mm], axis=1),
+        BLUE,
+        size=5,
+        links=[links[o.capture] for o in evidence.observations],
+    )
+    return axes
 
 
-def _zero(axes: Any) -> None:
-    axes.axhline(0, color=QUIET, linewidth=0.8)
-    axes.grid(axis="y")
+def _residual_axes(
+    x_limits: tuple[float, float], x: Array, mean_mm: Array, spread_mm: Array, x_label: str
+) -> Axes:
+    """Start a drawing of residuals with a line at 0 and bars of one standard deviation."""
+    low_mm, high_mm = mean_mm - spread_mm, mean_mm + spread_mm
+    y_limits = svg.padded(low_mm, high_mm, np.zeros(1))
+    axes = Axes(_LOW, x_limits, y_limits, x_label=x_label, y_label="behind the plane, mm", grid="y")
+    axes.horizontal(0.0, QUIET)
+    axes.lines(np.stack([x, low_mm], axis=1), np.stack([x, high_mm], axis=1), FAINT, width=1.2)
+    return axes
 
 
-def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
+def draw_corners(evidence: Evidence, lens: Intrinsics) -> Axes:
     """Draw the mean residual of the corners in each cell of the image as an arrow."""
-    figure, axes = _image_axes(lens)
+    axes = _image_axes(lens)
     every = max(1, len(evidence.corners_px) // 1500)
-    axes.plot(*evidence.corners_px[::every].T, ".", color=FAINT, markersize=1)
+    axes.dots(evidence.corners_px[::every], FAINT, size=1.4)
     _add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
-    return drawing(figure, "Residuals of the corners in the image")
+    return axes
 
 
-def _add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
+def _add_mean_arrows(axes: Axes, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
     """Draw the mean residual of (N, 2) in each cell of the image; a typical arrow fills its cell."""
     cell_px = lens.width_px / _CELLS
     cells, index, counts = np.unique(
@@ -200,9 +197,5 @@ def _add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: In
     if not len(means):
         return
     usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
-    scale = usual_px / cell_px
-    arrows = axes.quiver(
-        *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
-    )
-    label = f"{significant(usual_px)} px "
-    axes.quiverkey(arrows, 0.92, 1.11, usual_px, label, labelpos="W", labelcolor=INK)
+    longer = cell_px / usual_px
+    axes.arrows(means[:, :2], longer * means[:, 2:], BLUE, unit=cell_px, key=f"{significant(usual_px)} px")

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.board import Board
@@ -26,8 +25,8 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.findings import advice_of
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.show.overlays.canvas import accumulated
-from lce_rig.show.page import render, style
+from lce_rig.show.overlays.canvas import Thumbnail, Thumbnails, accumulated, reduced
+from lce_rig.show.page import render
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.tables import result_tables, rig_table, scene_words
@@ -39,13 +38,21 @@ _USUAL_M = 10.0
 _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 
-def report_page(session: Session, file: ResultFile, overlays: str, *, has_previous: bool = False) -> str:
+def report_page(
+    session: Session,
+    file: ResultFile,
+    overlays: str,
+    thumbnails: Thumbnails | None = None,
+    *,
+    has_previous: bool = False,
+) -> str:
     """Write the report of a result as one HTML file: the same result gives the same bytes.
 
     Args:
         session: whose result it is.
         file: the result.
         overlays: the folder of overlays beside the report, which shows them once they are drawn.
+        thumbnails: of the session, if some are known; the page is the same without.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
     origin, folder = file.provenance, session.path.resolve().name
@@ -62,12 +69,12 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
     has_folders = sum(max(len(c.channels), 1) for c in file.pairs) > 1
     pairs = []
     for k, c in enumerate(file.pairs):
-        with style(f"pair-{k}"):
-            pair = _pair(session.rig, c, f"pair-{k}")
+        pair = _pair(session.rig, c, f"pair-{k}")
         for capture in pair["captures"]:
             capture["overlays"] = _overlays(session.capture(capture["name"]), c, overlays, has_folders)
         # As many of each camera, so that the whole page stays small.
-        pair["gallery"] = _gallery(session, c, pair["captures"], _MOST_PICTURES // len(file.pairs))
+        n_most = _MOST_PICTURES // len(file.pairs)
+        pair["gallery"] = _gallery(session, c, pair["captures"], n_most, thumbnails or {})
         pair["steps"] = _next_steps(c, folder, has_previous)
         pair["rejecting"] = ""
         for worst in pair["gallery"][:1]:
@@ -118,7 +125,11 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
 
 
 def _gallery(
-    session: Session, c: Calibration, captures: Sequence[Mapping[str, Any]], n_most: int
+    session: Session,
+    c: Calibration,
+    captures: Sequence[Mapping[str, Any]],
+    n_most: int,
+    thumbnails: Thumbnails,
 ) -> list[dict[str, Any]]:
     """List captures with their pictures, those with the largest residuals first."""
     board, lens = session.rig.board.to_board(), None
@@ -128,7 +139,9 @@ def _gallery(
     order = order[: max(n_most, 1)]
 
     def picture(k: int) -> str:
-        return "" if lens is None else picture_of(session.capture(c.residuals[k].capture), c, board, lens)
+        if lens is None:
+            return ""
+        return picture_of(session.capture(c.residuals[k].capture), c, board, lens, thumbnails)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the time goes into decoding
         pictures = list(pool.map(picture, (k for k, _ in order)))
@@ -149,13 +162,20 @@ def _drawings(
     if evidence is None or lens is None:
         return {}
     links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
-    return {
-        "in_image": drawings.draw_in_image(evidence, board, lens, links),
-        "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-        "by_ring": drawings.draw_by_ring(evidence),
-        "by_range": drawings.draw_by_range(evidence, links),
-        "corners": drawings.draw_corners(evidence, lens),
+    drawn = {
+        "in_image": (
+            drawings.draw_in_image(evidence, board, lens, links),
+            "Outlines of the boards in the image",
+        ),
+        "from_above": (
+            drawings.draw_from_above(c, evidence, board, lens, links),
+            "Boards around the LiDAR, from above",
+        ),
+        "by_ring": (drawings.draw_by_ring(evidence), "Residuals by ring"),
+        "by_range": (drawings.draw_by_range(evidence, links), "Residuals by range"),
+        "corners": (drawings.draw_corners(evidence, lens), "Residuals of the corners in the image"),
     }
+    return {name: axes.markup(label, f"{anchor}-{name}") for name, (axes, label) in drawn.items()}
 
 
 def _statement(c: Calibration) -> str:
@@ -218,12 +238,14 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     ]
 
 
-_MOST_PX, _QUALITY, _OUTLINE_BGR = 320, 60, (0, 140, 255)
+_QUALITY, _OUTLINE_BGR = 60, (0, 140, 255)
 # Length of the events in a picture, ns: enough to show the board's edges.
 _EVENTS_NS = 20_000_000
 
 
-def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics) -> str:
+def picture_of(
+    capture: Capture, c: Calibration, board: Board, lens: Intrinsics, thumbnails: Thumbnails
+) -> str:
     """Draw a capture's image with the board's outline; raw events if the capture has no image.
 
     Args:
@@ -231,6 +253,7 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
         c: the result; its channels are tried in their order.
         board: of the outline.
         lens: of the camera.
+        thumbnails: images that need no decoding.
 
     Returns:
         A data URI; "" if the capture has neither image nor events, or damaged ones.
@@ -243,35 +266,33 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
     with suppress(LceRigError):
         for channel in c.channels:
             if capture.has_image(c.camera, channel):
-                return data_uri(capture.image(c.camera, channel).pixels, outline)
+                known = thumbnails.get((capture.name, c.camera, channel))
+                return data_uri(known or reduced(capture.image(c.camera, channel).pixels), outline)
         if c.camera in capture.event_cameras:
             events = capture.events(c.camera)
             if stamp_ns is None:  # the last ones
                 stamp_ns = (int(events.t_ns[-1]) if len(events) else 0) - _EVENTS_NS // 2
             near = events.between(stamp_ns - _EVENTS_NS // 2, stamp_ns + _EVENTS_NS // 2)
-            return data_uri(accumulated(near), outline)
+            return data_uri(reduced(accumulated(near)), outline)
     return ""
 
 
-def data_uri(pixels: NDArray[np.uint8], outline: Array) -> str:
-    """Shrink an image to at most 320 px and draw an outline into it.
+def data_uri(thumbnail: Thumbnail, outline: Array) -> str:
+    """Draw an outline into a reduced image.
 
     Args:
-        pixels: (H, W) grey or (H, W, 3) BGR.
-        outline: (N, 2) px; points that are not finite are left out.
+        thumbnail: of the image; it stays as it is.
+        outline: (N, 2) px of the image; points that are not finite are left out.
 
     Returns:
         A JPEG as a data URI.
     """
-    height, width = pixels.shape[:2]
-    scale = min(1.0, _MOST_PX / width, _MOST_PX / height)
-    size = max(1, round(scale * width)), max(1, round(scale * height))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    drawn = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+    small = thumbnail.pixels
+    drawn = small.copy() if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
     line = outline[np.isfinite(outline).all(axis=1)]
     if len(line):
         # Pixel centres are at whole numbers, before and after; 4 bits of fraction.
-        at = (line + 0.5) * size[0] / width - 0.5
+        at = (line + 0.5) * small.shape[1] / thumbnail.width_px - 0.5
         points = np.round(16 * np.clip(at, -1e4, 1e4)).astype(np.int32)
         cv2.polylines(drawn, [points], True, _OUTLINE_BGR, 2, cv2.LINE_AA, 4)
     content = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()

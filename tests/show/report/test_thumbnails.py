@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lce_rig.show.overlays.canvas import Thumbnail, reduced
 from lce_rig.show.report.calibration_page import data_uri, worst_first
 from tests.show.report.conftest import RLFS
 
@@ -19,7 +20,7 @@ def decoded(uri):
 @pytest.mark.parametrize("shape", [(1200, 1920, 3), (260, 346), (3000, 200), (40, 30)])
 def test_a_picture_is_small_and_of_its_image_s_shape(shape):
     pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    uri = data_uri(pixels, np.array([[np.nan, 1.0], [1e9, -1e9]]))
+    uri = data_uri(reduced(pixels), np.array([[np.nan, 1.0], [1e9, -1e9]]))
     height, width = decoded(uri).shape[:2]
     assert max(height, width) <= 320
     assert width / height == pytest.approx(shape[1] / shape[0], rel=0.05)
@@ -27,7 +28,7 @@ def test_a_picture_is_small_and_of_its_image_s_shape(shape):
 
 def test_the_outline_lies_where_the_board_is():
     square = np.array([[400.0, 200.0], [800.0, 200.0], [800.0, 500.0], [400.0, 500.0]])
-    drawn = decoded(data_uri(np.zeros((720, 1280, 3), np.uint8), square)).astype(int)
+    drawn = decoded(data_uri(reduced(np.zeros((720, 1280, 3), np.uint8)), square)).astype(int)
     v, u = np.nonzero(drawn.sum(axis=2) > 150)
     assert (u.min(), v.min(), u.max(), v.max()) == pytest.approx((100, 50, 200, 125), abs=3)
 
@@ -48,3 +49,15 @@ def test_page_shows_captures_and_the_worst(one, page):
     assert shown[0] == residuals[3].capture
     assert f"--without {shown[0]}" in text
     assert text.count("data:image/jpeg") == len(residuals)
+
+
+def test_known_thumbnails_replace_their_images_only(one, page):
+    name = one.residuals[0].capture
+    known = {(name, "cam", "frames"): Thumbnail(np.zeros((90, 160, 3), np.uint8), 1280)}
+    shown, decoded_anew = (
+        {capture: uri for uri, capture in re.findall(r'src="(data:[^"]+)" alt="Capture ([^"]+)"', text)}
+        for text in (page(RLFS, one, thumbnails=known), page(RLFS, one))
+    )
+    assert decoded(shown.pop(name)).shape == (90, 160, 3)
+    assert decoded(decoded_anew.pop(name)).shape != (90, 160, 3)
+    assert shown == decoded_anew
