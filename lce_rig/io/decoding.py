@@ -101,7 +101,8 @@ def decode_ply(data: bytes) -> NDArray[Any]:
         http://paulbourke.net/dataformats/ply/
     """
     file = io.BytesIO(data)
-    encoding, sizes, columns = "", dict[str, int](), dict[str, list[tuple[str, str]]]()
+    encoding, element = "", ""
+    sizes, columns = dict[str, int](), dict[str, list[tuple[str, str]]]()
     while words := file.readline().decode("ascii").split():
         if words[0] == "format":
             encoding = words[1]

@@ -284,7 +284,7 @@ def _store(views: Sequence[View], rig: Rig, path: Path) -> list[View]:
             if any(_SCENE not in capture.meta for capture in session.captures):
                 raise SessionError(
                     f"{path} holds captures of a board",
-                    "Name another folder for the scene: `lce-rig calibrate --scene DRIVE --rig FILE FOLDER`.",
+                    "Name another folder: `lce-rig calibrate --scene RECORDING --rig FILE FOLDER`.",
                 )
             session.adopt(rig)
     named = []

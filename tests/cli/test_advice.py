@@ -110,15 +110,16 @@ def test_an_advised_command_can_be_typed(place, command):
     assert _lacking(command) == ""
 
 
-# `doctor` has no simulated sensors: it is parsed only. `fleet run` makes the workbench's registry.
-# Without a recording `collect` has a simulated rig.
-PARSED_ONLY = {"doctor"}
+# `doctor` has no simulated sensors, and the workbench's recording no scene: these are parsed only.
+# `fleet run` makes the workbench's registry. Without a recording `collect` has a simulated rig.
+PARSED_ONLY = {"doctor", "calibrate --scene"}
 _VALUES = {
     "--targets": "deploy.yaml",
     "--robot": "kestrel",
     "--rig": "rig.yaml",
     "--channels": "frames",
     "--from": "recording",
+    "--scene": "recording",
     "--save-profile": "new.yaml",
     "--result": "session/calibration/result.json",
     "--name": "second",
