@@ -12,13 +12,14 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration, Opinion, SceneOpinion, State
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.findings import KINDS, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
 from lce_rig.judge.reach import JointDifference
 from lce_rig.scene.edge_pyramid import SIGMAS_RAD
 from lce_rig.scene.estimate import REACH, SceneEstimate, estimate_scene
 from lce_rig.scene.findings import (
     AMBIGUOUS,
+    BEYOND_REACH,
     CHANGED,
     CLOCKS_APART,
     DOUBTFUL,
@@ -26,6 +27,7 @@ from lce_rig.scene.findings import (
     FEW_EDGES,
     UNCHANGED,
     UNKNOWN,
+    WEAK,
 )
 from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 
@@ -102,7 +104,7 @@ class SceneDrift:
         if estimate.state == "few_edges":
             return FEW_EDGES(n_edges=estimate.n_edges, n_captures=self.n_captures)
         if not self._is_located:
-            return KINDS[f"scene.{estimate.state}"]()
+            return (WEAK if estimate.state == "weak" else BEYOND_REACH)()
         if self.change.chi2 > CHANGED_CHI2:
             if estimate.state == "usable":
                 return CHANGED(**self.change.figures)
