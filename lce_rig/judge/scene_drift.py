@@ -16,7 +16,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
 from lce_rig.judge.reach import JointDifference
 from lce_rig.scene.edge_pyramid import SIGMAS_RAD
-from lce_rig.scene.estimate import REACH, SceneEstimate, estimate_scene
+from lce_rig.scene.estimate import HOLDS_CHI2, REACH, SceneEstimate, estimate_scene, significance
 from lce_rig.scene.findings import (
     AMBIGUOUS,
     BEYOND_REACH,
@@ -29,10 +29,8 @@ from lce_rig.scene.findings import (
     UNKNOWN,
     WEAK,
 )
-from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
+from lce_rig.scene.outline_score import OutlineScore, OutlineView
 
-HOLDS_CHI2 = 16.81
-"""Largest chi-squared, of six degrees of freedom, of extrinsics that hold: 99 %."""
 CHANGED_CHI2 = 27.86
 """Least chi-squared of changed extrinsics: a chance of 1e-4. The largest of unchanged ones that was measured
 is 23.6, in one of ten groups of three KITTI views: the covariance is optimistic there."""
@@ -182,9 +180,5 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
 
 def _gain(views: Sequence[OutlineView], lens: Intrinsics, T_best: Array, T_other: Array) -> float:
     """Compute the significance, by blocks of the image, of the score of extrinsics over that of others."""
-    best, other = (
-        OutlineScore(views, lens, T, len(SIGMAS_RAD) - 1).edges(np.zeros(6)) for T in (T_best, T_other)
-    )
-    block = OutlineScore(views, lens, T_best, 0).blocks(best[2])
-    gains = np.bincount(block, best[0] - other[0], N_BLOCKS)
-    return float(gains.sum() / max(float(np.linalg.norm(gains)), 1e-12))
+    best, other = (OutlineScore(views, lens, T, len(SIGMAS_RAD) - 1) for T in (T_best, T_other))
+    return significance(best, np.zeros(6), other, np.zeros(6))

@@ -16,8 +16,9 @@ from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
-from lce_rig.judge.scene_drift import HOLDS_CHI2, SceneDrift, watch_scene
+from lce_rig.judge.scene_drift import SceneDrift, watch_scene
 from lce_rig.rig import Rig
+from lce_rig.scene.estimate import HOLDS_CHI2
 from lce_rig.scene.findings import (
     CLOCKS_APART,
     CLOCKS_INSTEAD,

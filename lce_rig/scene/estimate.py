@@ -36,8 +36,9 @@ _LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flat
 _MIN_EDGES = 60
 MIN_SCORE = 0.10  # Images and scans that do not belong together reach 0.06.
 _MIN_GAIN = 2.0  # Significance over another maximum
-_EXCLUDED_CHI2 = 16.81  # 99 % of six degrees of freedom: a maximum nearer by is no other one
-# Non-centrality of a chi-squared of six degrees of freedom that exceeds 16.81 in 95 % of the cases.
+HOLDS_CHI2 = 16.81
+"""Largest chi-squared, of six degrees of freedom, of poses that count as one: 99 %."""
+# Non-centrality of a chi-squared of six degrees of freedom that exceeds HOLDS_CHI2 in 95 % of the cases.
 _NOTICED = 27.04
 _CONTROL_SIGMAS = 3.0  # Extrinsics moved so far must score less.
 _UNDETERMINED = 0.5  # Standard deviation of a direction that the scene does not determine, in reaches.
@@ -154,7 +155,7 @@ def find_better_focal(
         lens = replace(intrinsics, fx_px=scale * intrinsics.fx_px, fy_px=scale * intrinsics.fy_px)
         score = OutlineScore(views, lens, T_cam_lidar, level)
         tangent, value = _climb(score, np.zeros(6), REACH)
-        if value > best_value and _significance(score, tangent, own, np.zeros(6)) > _MIN_GAIN:
+        if value > best_value and significance(score, tangent, own, np.zeros(6)) > _MIN_GAIN:
             best_value, better = value, step
     return better
 
@@ -204,13 +205,11 @@ def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
 
 def _gain(score: OutlineScore, best: Array, others: Sequence[Array], cov: Array) -> float:
     """Compute the least significance, by blocks, of the maximum over others that its covariance excludes."""
-    others = [
-        other for other in others if (other - best) @ np.linalg.solve(cov, other - best) > _EXCLUDED_CHI2
-    ]
-    return min((_significance(score, best, score, other) for other in others), default=np.inf)
+    others = [other for other in others if (other - best) @ np.linalg.solve(cov, other - best) > HOLDS_CHI2]
+    return min((significance(score, best, score, other) for other in others), default=np.inf)
 
 
-def _significance(score: OutlineScore, tangent: Array, other: OutlineScore, other_tangent: Array) -> float:
+def significance(score: OutlineScore, tangent: Array, other: OutlineScore, other_tangent: Array) -> float:
     """Compute by how many standard deviations, from the scatter of blocks, one score exceeds another."""
     shares, _, pixels = score.edges(tangent)
     gains = np.bincount(score.blocks(pixels), shares - other.edges(other_tangent)[0], N_BLOCKS)
