@@ -284,11 +284,11 @@ def _known_of(
     """Choose the pair of a camera with the most captures, one with a LiDAR if there is any."""
     of_lidars = [e for pair, e in cameras.items() if camera in pair]
     if of_lidars:
-        d = max(of_lidars, key=lambda e: len(e.used)).diagnostics
+        main = max(of_lidars, key=lambda e: len(e.used))
+        d = main.diagnostics
         tilt_rad, spin_rad = np.radians([d.noise_tilt_deg, d.noise_spin_deg]).tolist()
         values = tilt_rad, spin_rad, d.noise_depth_m, d.noise_across_m
-        lens = max(of_lidars, key=lambda e: len(e.used)).lens
-        return _Known(lens, dict(zip(OF_IMAGES, values, strict=True)))
+        return _Known(main.lens, dict(zip(OF_IMAGES, values, strict=True)))
     pairs = [
         (len(each.start.observations), pair, each)
         for pair, each in between.items()
@@ -342,8 +342,7 @@ def _list_images(
 ) -> Iterator[_Seen]:
     """List what two cameras saw."""
     first = list(given.start.observations)
-    boards = [o.lidar.image for o in first if isinstance(o.lidar, PatternBoard)]
-    second = [replace(o, image=image) for o, image in zip(first, boards, strict=True) if image is not None]
+    second = [replace(o, image=o.lidar.image) for o in first if isinstance(o.lidar, PatternBoard)]
     for name, observations, lens in zip(pair, (first, second), given.lenses, strict=True):
         best = lenses[name]
         found = observations if best is None or best is lens else best.refit(observations)

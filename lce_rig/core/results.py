@@ -209,7 +209,7 @@ class LidarBoard:
         return asdict(self.quality)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PatternBoard(LidarBoard):
     """The board in an image of another camera: its corners are the points, and it has no ring ends.
 
@@ -217,7 +217,7 @@ class PatternBoard(LidarBoard):
         image: the detection.
     """
 
-    image: ImageBoard | None = None
+    image: ImageBoard
 
     @classmethod
     def of(cls, image: ImageBoard, corners: Array) -> "PatternBoard":

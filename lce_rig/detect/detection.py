@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -157,10 +157,15 @@ class Detections:
             if best[first][1] & best[second][1]
         ]
 
-    def peers(self, lidars: Iterable[str]) -> list[Pair]:
-        """List every two of the LiDARs named, and every two cameras of which one shares no LiDAR's scan."""
-        with_lidar = {pair.camera for pair in self.pairs}
-        of_cameras = [p for p in self.camera_pairs() if not {p.camera, p.lidar} <= with_lidar]
+    def peers(self, lidars: Iterable[str], with_lidar: Collection[str] | None = None) -> list[Pair]:
+        """List every two of the LiDARs named, and every two cameras of which one has no LiDAR.
+
+        Args:
+            lidars: names.
+            with_lidar: cameras with a LiDAR; by default those that share captures with one.
+        """
+        related = {pair.camera for pair in self.pairs} if with_lidar is None else set(with_lidar)
+        of_cameras = [p for p in self.camera_pairs() if not {p.camera, p.lidar} <= related]
         return [*self.lidar_pairs(lidars), *of_cameras]
 
     def between(self, pair: Pair, board: Board) -> "Detections":

@@ -58,7 +58,6 @@ from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
     find_named,
     judged_peers,
-    list_peers,
     solve_peers,
     with_estimate,
 )
@@ -239,7 +238,7 @@ def calibrate_detections(
         # A camera has one lens: that of its pair with the most captures.
         by_size = sorted(alone, key=lambda own: len(own.estimate.used))
         lenses = {own.camera: own.estimate.lens for own in by_size}
-        peers = list_peers(rig, detections, lenses)
+        peers = detections.peers(rig.lidars, with_lidar=lenses)
         between, lacking = solve_peers(
             rig, detections, peers, options or CalibrateOptions(), lenses, progress
         )

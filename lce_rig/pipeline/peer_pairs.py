@@ -5,7 +5,7 @@ T_cam_lidar takes points from the second sensor's frame to the first's. Two came
 them has no LiDAR; where both have one, its result relates them.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,18 +113,6 @@ def solve_peers(
     return solved, shortages
 
 
-def list_peers(rig: Rig, detections: Detections, solved: Collection[str]) -> list[Pair]:
-    """List every two LiDARs that share captures, and every two cameras of which one has no LiDAR.
-
-    Args:
-        rig: the profile.
-        detections: of the session.
-        solved: cameras with extrinsics to a LiDAR.
-    """
-    of_cameras = [p for p in detections.camera_pairs() if not {p.camera, p.lidar} <= set(solved)]
-    return [*detections.lidar_pairs(rig.lidars), *of_cameras]
-
-
 def with_estimate(rig: Rig, own: SolvedPeers, estimate: CalibrationEstimate) -> SolvedPeers:
     """Replace the estimate and check it anew."""
     return replace(own, estimate=estimate, validation=_validate(rig, own.pair, own.given, estimate))
@@ -209,12 +197,7 @@ def _solve(
             )
             for name in names
         )
-        boards_of_second = {c.capture: c.lidar for c in candidates}
-        seen = {
-            each.capture: (each.image, found.image)
-            for each in candidates
-            if isinstance(found := boards_of_second[each.capture], PatternBoard) and found.image is not None
-        }
+        seen = {o.capture: (o.image, o.lidar.image) for o in candidates if isinstance(o.lidar, PatternBoard)}
         given = match_cameras(seen, board, (first, second))
     else:
         first, second = (EstimateSettings.of(options, rig.lidars[name]) for name in names)

@@ -222,7 +222,7 @@ def stack_captures(
     order = {name: k for k, name in enumerate(sorted(lidars))}
     scans = stack_scans([interior(lidars[name], board) for name in order], board)
     seen = [{o.capture: o.image for o in camera} for camera in cameras]
-    by_base = {name: b.image for name, b in lidars.items() if isinstance(b, PatternBoard) and b.image}
+    by_base = {name: b.image for name, b in lidars.items() if isinstance(b, PatternBoard)}
     images = [
         stack_images(
             np.array([order[name] for name in of_camera]),
