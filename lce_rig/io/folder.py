@@ -16,6 +16,7 @@ from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
+from lce_rig.core.progress import Progress
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
 from lce_rig.io.findings import NOT_DECODED, worded
@@ -322,6 +323,33 @@ def _clouds(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
         ]
         for lidar, paths in found.items()
     ]
+
+
+def read_pairs(
+    pairs: Sequence[PlacementOnDisk], notes: list[str], progress: Progress
+) -> Iterator[tuple[str, tuple[Image, ...], tuple[Scan, ...]]]:
+    """Read pairs: label, images and scans of each; damaged ones are skipped.
+
+    Args:
+        pairs: of a `FolderRecording`.
+        notes: receives the pairs that were skipped.
+        progress: called with (done, total).
+
+    Raises:
+        SourceError: not one could be read; the cause of the first.
+    """
+    failures: list[SourceError] = []
+    for done, files in enumerate(pairs, start=1):
+        try:
+            images, scans, _ = files.read()
+        except SourceError as error:
+            failures.append(error)
+        else:
+            yield files.label, images, scans
+        progress(done, len(pairs))
+    if failures and len(failures) == len(pairs):
+        raise failures[0]
+    notes += [f"skipped: {error.what}" for error in failures]
 
 
 class ImagesRecording:

@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 from lce_rig.core.data import Events, Sample, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
+from lce_rig.core.progress import Progress
 from lce_rig.io.findings import CLOCK_SET_BACK, OUT_OF_ORDER
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import event_channel, rig_time_ns, stream_of
@@ -274,6 +275,16 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
         if length_s - overlap_s > _USUAL_LAG_S:
             covered = f"{max(overlap_s, 0.0):.1f} of the {length_s:.1f} s of {lidar}'s scans"
             notes.append(f"{camera}: {camera.kind} cover {covered}")
+
+
+def read_samples(recording: ContinuousRecording, rig: Rig, progress: Progress) -> Iterator[Sample]:
+    """Read a whole recording as `check_overlap` does; events do not count in its progress."""
+    done = 0
+    for sample in check_overlap(recording.samples(), rig, recording.notes):
+        yield sample
+        if not isinstance(sample, Events):
+            done += 1
+            progress(done, recording.n_samples)
 
 
 def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: tuple[int, int]) -> None:

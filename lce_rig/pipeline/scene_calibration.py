@@ -5,7 +5,7 @@ LiDAR -> checks, verdict, overlays
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.calibration import BY_SCENE, MOTIONS, Calibration, Certificate, Metrics
-from lce_rig.core.data import Image, Sample, Scan
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import (
     NotEnoughDataError,
     ProfileError,
@@ -27,8 +27,8 @@ from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.io import open_recordings
-from lce_rig.io.folder import FolderRecording
-from lce_rig.io.recording import ContinuousRecording, check_overlap, join_recordings, require_sensors
+from lce_rig.io.folder import FolderRecording, read_pairs
+from lce_rig.io.recording import ContinuousRecording, join_recordings, read_samples, require_sensors
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.verdict import nominal_findings, with_findings
 from lce_rig.pipeline.findings import (
@@ -238,32 +238,15 @@ def _read(paths: Sequence[Path], rig: Rig, notes: list[str], progress: Progress)
 
 
 def _of_folder(recording: FolderRecording, notes: list[str], progress: Progress) -> Iterator[View]:
-    chosen = evenly(recording.pairs, _MOST_VIEWS)
-    failures: list[SourceError] = []
-    for done, files in enumerate(chosen, start=1):
-        try:
-            images, scans, _ = files.read()
-            yield View(files.label, tuple(images), tuple(scans), {})
-        except SourceError as error:
-            failures.append(error)
-        progress(done, len(chosen))
-    if failures and len(failures) == len(chosen):
-        raise failures[0]
-    notes += [f"skipped: {error.what}" for error in failures]
+    for label, images, scans in read_pairs(evenly(recording.pairs, _MOST_VIEWS), notes, progress):
+        yield View(label, images, scans, {})
 
 
 def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> list[View]:
     require_sensors(recording, rig)
     losses, kept = Losses(), _Spread()
-
-    def counted() -> Iterator[Sample]:
-        samples: Iterable[Sample] = check_overlap(recording.samples(), rig, recording.notes)
-        for done, sample in enumerate(samples, start=1):
-            yield sample
-            progress(min(done, recording.n_samples), recording.n_samples)
-
     previous: dict[str, Scan] = {}
-    for frame in pair_by_time(counted(), rig, losses):
+    for frame in pair_by_time(read_samples(recording, rig, progress), rig, losses):
         if frame.images and frame.scans:
             kept.take(View(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, previous))
         previous = {scan.sensor: scan for scan in frame.scans}

@@ -3,7 +3,7 @@
 Captures come from sessions, recordings of all kinds and attached sensors, in bounded memory.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
-from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import transform
@@ -22,8 +22,8 @@ from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
-from lce_rig.io.folder import FolderRecording
-from lce_rig.io.recording import ContinuousRecording, check_overlap, join_recordings, require_sensors
+from lce_rig.io.folder import FolderRecording, read_pairs
+from lce_rig.io.recording import ContinuousRecording, join_recordings, read_samples, require_sensors
 from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, PairJudge, Seen, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import with_lenses_of
@@ -138,31 +138,14 @@ class SceneCaptures:
 
     def _take_pairs(self, recording: FolderRecording, progress: Progress) -> None:
         pairs = evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
-        failures: list[SourceError] = []
-        for done, files in enumerate(pairs, start=1):
-            try:
-                images, scans, _ = files.read()
-                self._take(files.label, images, scans)
-            except SourceError as error:
-                failures.append(error)
-            progress(done, len(pairs))
-        if failures and len(failures) == len(pairs):
-            raise failures[0]
-        self.notes += [f"skipped: {error.what}" for error in failures]
+        for label, images, scans in read_pairs(pairs, self.notes, progress):
+            self._take(label, images, scans)
 
     def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
         require_sensors(recording, self._rig)
         losses = Losses()
-
-        def counted() -> Iterator[Sample]:
-            done = 0
-            for sample in check_overlap(recording.samples(), self._rig, recording.notes):
-                yield sample
-                if not isinstance(sample, Events):
-                    done += 1
-                    progress(done, recording.n_samples)
-
-        for frame in pair_by_time(counted(), self._rig, losses, are_events_enough=True):
+        samples = read_samples(recording, self._rig, progress)
+        for frame in pair_by_time(samples, self._rig, losses, are_events_enough=True):
             self.take_frame(frame)
         if not any(self.kept) and losses.counts():
             (why, n), *_ = losses.counts()
