@@ -29,7 +29,6 @@ from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
 from lce_rig.pipeline.detect_session import unlike_models
 from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
-from lce_rig.pipeline.scene_calibration import calibrate_scene
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
 from lce_rig.show.tables import result_tables, rig_table
@@ -251,6 +250,8 @@ def _calibrate_scene(
     force: bool,
 ) -> None:
     """Estimate extrinsics from a drive, write them, and print them."""
+    from lce_rig.pipeline.scene_calibration import calibrate_scene
+
     rig = None if profile is None else lce.load_rig(profile)
     if rig is not None:
         require_sensors("camera", cameras, rig.cameras)
