@@ -202,10 +202,8 @@ class Planner:
         if beside:
             few = np.argsort(cost, kind="stable")[:_BEST]
             for other in beside:
-                cost[few] += other.planner.shortfall_after(
-                    other.held, other.T_other_cam @ self.candidates[few]
-                )
-            cost[np.setdiff1d(np.arange(len(cost)), few)] += np.inf
+                left = other.planner.shortfall_after(other.held, other.T_other_cam @ self.candidates[few])
+                cost[few] -= left.max(initial=0.0) - left
         best = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
