@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from lce_rig.core.geometry import exp_so3, invert, pose
+from lce_rig.core.geometry import difference, exp_so3, invert, pose
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
-from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, photograph, random_pose, scan_board
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, photograph, random_pose, scan_board
 from tests.calibrate.two_cameras import REAL, T_RIGHT_LEFT
 
 T_REAR_FRONT = pose(exp_so3(np.radians([2.0, -3.0, 25.0])), np.array([0.15, -0.4, 0.06]))
@@ -94,6 +94,27 @@ def make_rig(sensors=SENSORS, seed=None):
 def between(first, second):
     """True pose (4, 4) of the second sensor in the first one's frame."""
     return ON_FRONT[first] @ invert(ON_FRONT[second])
+
+
+def error(result):
+    """Error (6,) of a result, used with the lenses that belong to it."""
+    T = result.T_cam_lidar
+    if result.intrinsics is not None:
+        T = in_use(T, result.intrinsics)
+    if result.lidar_intrinsics is not None:
+        T = invert(in_use(invert(T), result.lidar_intrinsics))
+    return difference(T, between(result.camera, result.lidar))
+
+
+def measure_errors(results):
+    """Compute rms errors, deg and mm, and the share of errors within the 95 % regions; print them."""
+    errors = [error(each) for each in results]
+    chi2 = np.array([x @ np.linalg.solve(c.cov, x) for x, c in zip(errors, results, strict=True)])
+    sizes = [[np.degrees(np.linalg.norm(x[3:])), 1e3 * np.linalg.norm(x[:3])] for x in errors]
+    rms_deg, rms_mm = np.sqrt(np.mean(np.square(sizes), axis=0))
+    covered = np.mean(chi2 < 12.59)
+    print(f"{len(chi2)} poses: rms {rms_deg:.3f} deg, {rms_mm:.1f} mm; {covered:.1%} within 95 %")
+    return rms_deg, rms_mm, covered
 
 
 def simulate(n, seed, *, sensors=SENSORS, n_seeing=(2, 3), scenario=REAL, moves=None):

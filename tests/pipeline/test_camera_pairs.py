@@ -9,8 +9,7 @@ from lce_rig.core.rig_poses import find_rig_poses
 from lce_rig.detect.detection import Detections
 from lce_rig.export import write_exports
 from lce_rig.pipeline.calibration import calibrate_detections
-from tests.calibrate.boards import in_use
-from tests.calibrate.four_sensors import ON_FRONT, between, make_rig, simulate
+from tests.calibrate.four_sensors import ON_FRONT, error, make_rig, measure_errors, simulate
 
 N = 20
 BOTH = ("left", "right")
@@ -19,12 +18,6 @@ BOTH = ("left", "right")
 def stereo(seed, **kwargs):
     """Profile with errors as it states them, and N placements that both cameras see."""
     return make_rig(BOTH, seed=seed), simulate(N, seed, sensors=BOTH, n_seeing=(2,), **kwargs)
-
-
-def error(c):
-    """Error (6,) of a result of two cameras, used with the lenses that belong to it."""
-    T = invert(in_use(invert(in_use(c.T_cam_lidar, c.intrinsics)), c.lidar_intrinsics))
-    return difference(T, between(c.camera, c.lidar))
 
 
 @pytest.fixture(scope="module")
@@ -110,13 +103,6 @@ def test_lidar_in_no_capture_is_named():
 @pytest.mark.slow
 def test_two_cameras_claims_cover_errors_of_many_sessions():
     """60 sessions of 20 placements, with profiles that err as they state."""
-    chi2, sizes = [], []
-    for seed in range(60):
-        (c,), _ = calibrate_detections(*stereo(seed))
-        x = error(c)
-        chi2.append(x @ np.linalg.solve(c.cov, x))
-        sizes.append([np.degrees(np.linalg.norm(x[3:])), 1e3 * np.linalg.norm(x[:3])])
-    rms_deg, rms_mm = np.sqrt(np.mean(np.square(sizes), axis=0))
-    covered = np.mean(np.array(chi2) < 12.59)
-    print(f"rms {rms_deg:.3f} deg, {rms_mm:.1f} mm; {covered:.1%} within 95 %")
+    results = [c for seed in range(60) for c in calibrate_detections(*stereo(seed))[0]]
+    rms_deg, rms_mm, covered = measure_errors(results)
     assert rms_deg < 0.03 and rms_mm < 6.0 and covered > 0.92
