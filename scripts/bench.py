@@ -53,19 +53,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
         lambda bench, a: bench(a.seeds or 100, a.only),
     ),
-    "lidars": (
-        "other LiDARs, simulated: boards found, errors, time of a search",
-        lambda bench, a: bench(a.captures or 20, a.output, a.only),
-    ),
-    "boards": (
-        "checkerboards and boards with markers, whole and covered: poses in images",
-        lambda bench, a: bench(a.captures or 60),
-    ),
     "borders": (
         "boards in scans whose border is hidden, smeared or merges with a stand, simulated",
         lambda bench, a: bench(a.captures or 50, a.only),
     ),
-    "growth": ("calibrate as sessions grow: time and memory", lambda bench, a: bench(a.output)),
     "fleet": ("sessions of many robots", lambda bench, a: bench(a.output, a.only)),
     "speed": ("detection, estimate, the command line", lambda bench, _: bench()),
 }
