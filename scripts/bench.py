@@ -1,17 +1,26 @@
 #!/usr/bin/env python3
 """Measure what docs/benchmarks.md claims and print it as Markdown tables.
 
+--record writes the figures that pages show into docs/figures.json and fills the pages from it. Figures
+of scripts/fuzz.py and of `time` stand in that file by hand.
+
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
 it on a machine that does nothing else. Parts that read recordings by others take them from the folder that
 LCE_RIG_DATA names.
 """
 
 import argparse
+import shlex
+import subprocess
 import sys
 from collections.abc import Callable
+from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from benchmarks.measured import MEASURED
+from figures_page import fill_pages, read_figures, shown_keys, write_figures
 
 # The stand-ins of devices, tests/wire, and simulated scans, tests/detect.
 _TESTS = Path(__file__).resolve().parents[1] / "tests"
@@ -85,9 +94,27 @@ def main() -> None:
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("build/bench"), help="folder of simulated sessions"
     )
+    parser.add_argument(
+        "--record", action="store_true", help="write the figures into docs/figures.json and the pages"
+    )
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     PARTS[arguments.part][1](bench, arguments)
+    if arguments.record:
+        record(shlex.join(["scripts/bench.py", *(word for word in sys.argv[1:] if word != "--record")]))
+
+
+def record(command: str) -> None:
+    """Write the measured figures that pages show, with the command, and fill the pages."""
+    state = ["git", "-C", str(_TESTS.parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    commit = subprocess.run(state, check=True, capture_output=True, text=True).stdout.strip()
+    figures, day = read_figures(), datetime.now(timezone.utc).date().isoformat()
+    for key in shown_keys() & MEASURED.keys():
+        value, unit = MEASURED[key]
+        source = {"command": command, "measured": day, "commit": commit}
+        figures[key] = {"value": value, "unit": unit, **source}
+    write_figures(figures)
+    fill_pages()
 
 
 if __name__ == "__main__":
