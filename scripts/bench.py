@@ -10,6 +10,7 @@ LCE_RIG_DATA names.
 """
 
 import argparse
+import os
 import shlex
 import subprocess
 import sys
@@ -101,7 +102,17 @@ def main() -> None:
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     PARTS[arguments.part][1](bench, arguments)
     if arguments.record:
-        record(shlex.join(["scripts/bench.py", *(word for word in sys.argv[1:] if word != "--record")]))
+        record(_command(sys.argv[1:]))
+
+
+def _command(words: list[str]) -> str:
+    """Return the command as anyone may type it, without folders of this computer."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--record", action="store_true")
+    parser.add_argument("-o", "--output")
+    _, kept = parser.parse_known_args(words)
+    data = "LCE_RIG_DATA=... " if os.environ.get("LCE_RIG_DATA") else ""
+    return data + shlex.join(["scripts/bench.py", *kept])
 
 
 def record(command: str) -> None:
