@@ -1,17 +1,27 @@
 #!/usr/bin/env python3
 """Measure what docs/benchmarks.md claims and print it as Markdown tables.
 
+--record writes the figures that pages show into docs/figures.json and fills the pages from it. Figures
+of scripts/fuzz.py and of `time` stand in that file by hand.
+
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
 it on a machine that does nothing else. Parts that read recordings by others take them from the folder that
 LCE_RIG_DATA names.
 """
 
 import argparse
+import os
+import shlex
+import subprocess
 import sys
 from collections.abc import Callable
+from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from benchmarks.measured import MEASURED
+from figures_page import fill_pages, read_figures, shown_keys, write_figures
 
 # The stand-ins of devices, tests/wire, and simulated scans, tests/detect.
 _TESTS = Path(__file__).resolve().parents[1] / "tests"
@@ -53,19 +63,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
         lambda bench, a: bench(a.seeds or 100, a.only),
     ),
-    "lidars": (
-        "other LiDARs, simulated: boards found, errors, time of a search",
-        lambda bench, a: bench(a.captures or 20, a.output, a.only),
-    ),
-    "boards": (
-        "checkerboards and boards with markers, whole and covered: poses in images",
-        lambda bench, a: bench(a.captures or 60),
-    ),
     "borders": (
         "boards in scans whose border is hidden, smeared or merges with a stand, simulated",
         lambda bench, a: bench(a.captures or 50, a.only),
     ),
-    "growth": ("calibrate as sessions grow: time and memory", lambda bench, a: bench(a.output)),
     "fleet": ("sessions of many robots", lambda bench, a: bench(a.output, a.only)),
     "speed": ("detection, estimate, the command line", lambda bench, _: bench()),
 }
@@ -94,9 +95,37 @@ def main() -> None:
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("build/bench"), help="folder of simulated sessions"
     )
+    parser.add_argument(
+        "--record", action="store_true", help="write the figures into docs/figures.json and the pages"
+    )
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     PARTS[arguments.part][1](bench, arguments)
+    if arguments.record:
+        record(_command(sys.argv[1:]))
+
+
+def _command(words: list[str]) -> str:
+    """Return the command as anyone may type it, without folders of this computer."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--record", action="store_true")
+    parser.add_argument("-o", "--output")
+    _, kept = parser.parse_known_args(words)
+    data = "LCE_RIG_DATA=... " if os.environ.get("LCE_RIG_DATA") else ""
+    return data + shlex.join(["scripts/bench.py", *kept])
+
+
+def record(command: str) -> None:
+    """Write the measured figures that pages show, with the command, and fill the pages."""
+    state = ["git", "-C", str(_TESTS.parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    commit = subprocess.run(state, check=True, capture_output=True, text=True).stdout.strip()
+    figures, day = read_figures(), datetime.now(timezone.utc).date().isoformat()
+    for key in shown_keys() & MEASURED.keys():
+        value, unit = MEASURED[key]
+        source = {"command": command, "measured": day, "commit": commit}
+        figures[key] = {"value": value, "unit": unit, **source}
+    write_figures(figures)
+    fill_pages()
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from bad_borders import SCENES, Scene
 from scans import BOARD, Shape, accumulate, cast
 from scipy import stats
 
+from benchmarks.measured import measure
 from benchmarks.tables import print_head, print_row
 from lce_rig.calibrate.likelihood.layout import OWN, State
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
@@ -107,6 +108,9 @@ def _bench_one(name: str, border: str, scene: Scene, n_poses: int) -> None:
     inside = np.array(chi2) < stats.chi2.ppf(0.95, 6)
     # As improbable as three standard deviations of one unknown.
     beyond = np.array(chi2) > stats.chi2.ppf(1 - 2 * stats.norm.sf(3), 6)
+    key = f"borders.{border}.{name}"
+    if chi2:
+        measure(key, "{} of {}, {:.0f} %", len(chi2), n_poses, 100 * inside.mean())
     print_row(
         name,
         border,

@@ -6,6 +6,7 @@ from typing import get_args
 
 from benchmarks.corruption_causes import NOTHING, Codes, cause_of_error, first_cause, independent_causes
 from benchmarks.corruption_kinds import SOUND
+from benchmarks.measured import measure
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
@@ -194,6 +195,19 @@ def print_causes(outcomes: Sequence[Outcome]) -> None:
         is_sound = o.corruption == SOUND or not o.is_beyond
         if false := o.false_causes if is_sound else o.second_causes:
             print_row(o.session, o.corruption, o.method, o.verdict, o.cause or "-", ", ".join(false))
+
+
+def measure_causes(outcomes: Sequence[Outcome]) -> None:
+    """Keep each session's counts of mistakes beyond the profile's tolerances."""
+    beyond = [o for o in outcomes if o.corruption != SOUND and not o.unobservable and o.is_beyond]
+    for session, method in {(o.session, o.method): None for o in beyond}:
+        own = [o for o in beyond if (o.session, o.method) == (session, method)]
+        key, n_right = f"corruptions.{session}.{method}", sum(o.is_right for o in own)
+        measure(f"{key}.mistakes", "{}", len(own))
+        measure(f"{key}.right", "{} ({:.0f} %)", n_right, 100 * n_right / len(own))
+        measure(f"{key}.second", "{}", sum(bool(o.second_causes) for o in own))
+        measure(f"{key}.unnoticed", "{}", sum(o.is_unnoticed for o in own))
+        measure(f"{key}.passes", "{}", sum(o.is_wrong and o.verdict == "pass" for o in own))
 
 
 def share(marks: Iterable[bool]) -> str:

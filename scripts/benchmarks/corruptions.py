@@ -15,6 +15,7 @@ from benchmarks.corruption_outcomes import (
     METHODS,
     Outcome,
     judged,
+    measure_causes,
     pair,
     print_causes,
     print_summary,
@@ -89,6 +90,7 @@ def bench_corruptions(
     print_summary(every)
     print("\n### Causes\n")
     print_causes(every)
+    measure_causes(every)
 
 
 def judge_session(

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import lce_rig as lce
+from benchmarks.measured import DEG_MM, measure
 from benchmarks.tables import compare, print_head, print_row, rms
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, transform
@@ -70,6 +71,16 @@ def _row(name: str, sessions: Sequence[SessionRun]) -> tuple[object, ...]:
     corners = [px for session in sessions for px in session.corner_px.get(name, [])]
     n = sum(session.n_captures for session in sessions)
     clocks = [session.clock_error_s[name] for session in sessions if name in session.clock_error_s]
+    key = f"events.{name}"
+    if corners:
+        measure(f"{key}.found", "{} of {}", len(corners), n)
+        measure(f"{key}.corners", "{:.2f} px", rms(np.array(corners)))
+    if runs:
+        measure(f"{key}.rms", DEG_MM, rms([run.deg for run in runs]), rms([run.mm for run in runs]))
+        claimed = rms([run.sigma_deg for run in runs]), rms([run.sigma_mm for run in runs])
+        measure(f"{key}.claim", DEG_MM, *claimed)
+    if clocks:
+        measure(f"{key}.clock", "{:.1f} ms", 1000 * rms(np.array(clocks)))
     errors = (
         ("-",) * 4
         if not runs

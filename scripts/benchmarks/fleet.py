@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
+from benchmarks.measured import measure
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.geometry import perturb
 from lce_rig.fleet.registry import SCHEMA, TABLE, Registry, as_table, in_order, table_bytes
@@ -80,6 +81,7 @@ def bench_sessions(folder: Path) -> None:
     print_head(
         "sessions", "run now", "robots", "rows", "status", "s", "s of a core", "of it in sessions", "MB"
     )
+    measure("fleet.session", "{:.1f} s", in_sessions_s / len(rows))
     megabytes = sum(path.stat().st_size for path in registry.rglob("*") if path.is_file()) / 1e6
     robots = len({row["robot"] for row in rows})
     states = ", ".join(f"{key} {n}" for key, n in summary["statuses"].items())
@@ -105,6 +107,8 @@ def compare_with_truth(root: Path, registry: Path) -> None:
             right.add(finding.subject)
     nudged = {robot for robot, nudge in truth.items() if nudge is not None}
     unchanged = truth.keys() - nudged
+    measure("fleet.named", "{} of {}", len(right), len(nudged))
+    measure("fleet.false", "{} of {}", len(named & unchanged), len(unchanged))
     print_head("robots", "nudged", "named", "with date", "unchanged", "named")
     print_row(
         len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged)

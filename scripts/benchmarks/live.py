@@ -20,6 +20,7 @@ from wire.rig import WireRig
 from wire.sync_board import FakeBoard
 from wire.timing import LOOP_NS
 
+from benchmarks.measured import measure
 from benchmarks.tables import print_head, print_row
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import Key, LiveOptions, LiveReport, LiveState
@@ -227,6 +228,12 @@ def print_load(load: Load) -> None:
     latencies_s = load.report.latencies_s
     sent = load.sent
     n_packets = lidar.n_packets or 0
+    measure("live.lost", "{}, {}, {}", lidar.n_lost, cam.n_dropped, davis.n_dropped)
+    measure("live.updates", "{:.1f} per second", len(gaps_s) / gaps_s.sum())
+    measure("live.gap", "{:.2f} s", gaps_s.max())
+    if latencies_s:
+        measure("live.safe", "{:.2f} s", max(latencies_s))
+    measure("live.load", "{:.2f} of a core, {:.0f} MB", load.cpu_s / load.wall_s, load.peak_bytes / 1e6)
     print_head("what", "figure")
     print_row("duration", f"{load.wall_s:.1f} s")
     print_row("packets sent, taken, lost by us", f"{sent['lidar']['sent']}, {n_packets:.0f}, {lidar.n_lost}")

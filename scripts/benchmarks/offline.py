@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.measured import measure
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import pose
@@ -51,6 +52,7 @@ def bench_offline(duration_s: float) -> None:
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
     took_s, used = time.monotonic() - began_s, resource.getrusage(resource.RUSAGE_CHILDREN)
     processor_s = used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime
+    measure("offline.time", "{:.1f} s for a bag of {:.0f} s", took_s, duration_s)
     print_head("what", "figure")
     print_row("bag", f"{duration_s:.1f} s, {bag.stat().st_size / 1e6:.0f} MB")
     print_row("captures", len(Session.open(session).captures))

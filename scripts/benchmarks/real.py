@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measured import DEG_MM, measure
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import transform
+from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.reach import as_used
@@ -22,6 +23,9 @@ from lce_rig.rig import Rig
 
 # 95 % of the chi-squared distribution with six degrees of freedom.
 _CHI2_95 = 12.59
+# Two cameras of one rig, each calibrated with the LiDAR alone.
+_CAMERAS = ("vlp32c_left", "vlp32c_right")
+_SIZE = "{:.2f} deg, {:.1f} mm"
 # Sessions of one rig: rlfs03 is of another day.
 _ONE_RIG = ("rlfs01", "rlfs02", "rlfs03")
 
@@ -32,6 +36,7 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
     print_head(*head.split(", "), "reported deg / mm", "verdict")
     clocks: list[tuple[object, ...]] = []
     of_one_rig: dict[str, Calibration] = {}
+    centres: dict[str, Array] = {}
     for recorded in SETS:
         if recorded.is_there and only in recorded.name:
             with tempfile.TemporaryDirectory() as scratch:
@@ -42,15 +47,24 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
                 print_row(*_row(recorded, rig, detections, channels, n_splits, method))
             if len(recorded.folders) > 1:
                 clocks += _clock_rows(recorded, rig, detections)
-            if recorded.name in _ONE_RIG:
-                of_one_rig[recorded.name] = calibrate_detections(rig, detections, EstimateSettings(method))[
-                    0
-                ][0]
+            if recorded.name in (*_ONE_RIG, *_CAMERAS):
+                (calibration, *_), _ = calibrate_detections(rig, detections, EstimateSettings(method))
+                if recorded.name in _ONE_RIG:
+                    of_one_rig[recorded.name] = calibration
+                else:
+                    centres[recorded.name] = invert(calibration.T_cam_lidar)[:3, 3]
     if len(of_one_rig) > 1:
         print()
         print_head("sessions of one rig", "apart deg / mm", "boards apart mm, rms")
         for (name, first), (other, second) in combinations(of_one_rig.items(), 2):
-            print_row(f"{name}, {other}", *_apart(first, second))
+            apart, boards_mm = _apart(first, second)
+            print_row(f"{name}, {other}", "{:.3f} / {:.1f}".format(*apart), f"{boards_mm:.1f}")
+            measure(f"real.{name}-{other}.{method}.apart", DEG_MM, *apart)
+            measure(f"real.{name}-{other}.{method}.boards", "{:.1f} mm", boards_mm)
+    if len(centres) == len(_CAMERAS):
+        baseline_mm = 1000 * float(np.linalg.norm(np.subtract(*centres.values())))
+        print(f"\n{' and '.join(_CAMERAS)}: {baseline_mm:.1f} mm apart")
+        measure(f"real.stereo.{method}.baseline", "{:.1f} mm", baseline_mm)
     if clocks:
         print()
         print_head("set", "channel", "captures", "corner noise px", "time offset ms")
@@ -78,18 +92,29 @@ def _row(
     reference = recorded.reference()
     halves = np.array(list(_halves(rig, detections, channels, n_splits, method)))
     apart_deg, apart_m = np.sqrt(np.mean(halves[:, :2] ** 2, axis=0))
+    name = recorded.name if len(recorded.folders) == 1 else f"{recorded.name} {' + '.join(channels)}"
+    n_within, n_used = np.count_nonzero(halves[:, 2] < _CHI2_95), len(calibration.captures_used)
+    sigma = calibration.sigma_rotation_deg, 1000 * calibration.sigma_translation_m
+    key = f"real.{name}.{method}"
+    measure(f"{key}.used", "{} of {}", n_used, len(seen))
+    measure(f"{key}.halves", _SIZE, apart_deg, 1000 * apart_m)
+    measure(f"{key}.chi2", "{:.2f}, {} of {}", np.mean(halves[:, 2]) / 6, int(n_within), len(halves))
+    measure(f"{key}.claim", _SIZE, *sigma)
+    measure(f"{key}.verdict", "{}", calibration.verdict)
+    if reference is not None:
+        measure(f"{key}.reference", _SIZE, *compare(calibration.T_cam_lidar, reference))
     return (
-        recorded.name if len(recorded.folders) == 1 else f"{recorded.name} {' + '.join(channels)}",
+        name,
         len(seen),
         sum(isinstance(image, ImageBoard) for image, _ in seen),
         sum(isinstance(lidar, list) for _, lidar in seen),
-        len(calibration.captures_used),
+        n_used,
         "-" if reference is None else "{:.3f} / {:.1f}".format(*compare(calibration.T_cam_lidar, reference)),
         f"{apart_deg:.3f} / {1000 * apart_m:.1f}",
         f"{np.mean(halves[:, 2]) / 6:.2f}",
-        f"{np.count_nonzero(halves[:, 2] < _CHI2_95)} of {len(halves)}",
+        f"{n_within} of {len(halves)}",
         f"{1000 * calibration.metrics.mge_m:.1f}",
-        f"{calibration.sigma_rotation_deg:.3f} / {1000 * calibration.sigma_translation_m:.1f}",
+        "{:.3f} / {:.1f}".format(*sigma),
         calibration.verdict,
     )
 
@@ -139,14 +164,14 @@ def _halves(
         yield compared.max_rotation_deg, compared.max_translation_m, compared.chi2
 
 
-def _apart(first: Calibration, second: Calibration) -> tuple[str, str]:
-    """Compare two results as they draw points: their difference, and how far apart they place boards."""
+def _apart(first: Calibration, second: Calibration) -> tuple[tuple[float, float], float]:
+    """Compare two results as they draw points: their difference, and how far apart they place boards, mm."""
     lens = first.intrinsics
     T = [c.T_cam_lidar if lens is None else as_used(c, lens) for c in (first, second)]
     boards = [o.lidar.T_lidar_board[:3, 3] for c in (first, second) for o in c.observations.values()]
     moved = transform(T[0], np.array(boards)) - transform(T[1], np.array(boards))
     rms_m = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
-    return "{:.3f} / {:.1f}".format(*compare(T[0], T[1])), f"{1000 * rms_m:.1f}"
+    return compare(T[0], T[1]), 1000 * float(rms_m)
 
 
 def _only(detections: Detections, names: set[str]) -> Detections:

@@ -9,7 +9,6 @@ import numpy as np
 
 import lce_rig as lce
 from benchmarks.recordings import SETS, RecordedSet
-from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import MOTIONS, Calibration, ResultFile
 from lce_rig.core.data import Image
@@ -26,7 +25,6 @@ from lce_rig.session import Session
 _NAMES = ("rlfs01", "rlfs02", "acfr_vlp16", "os1_64")
 _OF_ONE_RIG = (("rlfs01", "rlfs02"), ("rlfs02", "rlfs01"))
 _PART = 5
-_N_ROOMS = 10
 _STATES = ("changed", "unchanged", "unknown")
 _SIZES = np.array([0.1, 0.1, 0.1, *np.radians([1.0, 1.0, 1.0])])
 _UNIT = np.repeat([1000.0, np.degrees(1.0)], 3)
@@ -34,7 +32,7 @@ _UNIT = np.repeat([1000.0, np.degrees(1.0)], 3)
 
 @dataclass(frozen=True, eq=False)
 class _Watched:
-    """The views of one recorded set or simulated room, and its board calibration."""
+    """The views of one recorded set, and its board calibration."""
 
     rig: Rig
     calibration: Calibration
@@ -48,17 +46,7 @@ class _Watched:
             recorded.collect(Path(folder) / "session")
             session = Session.open(Path(folder) / "session")
             (c,) = lce.calibrate_session(session).pairs
-            return cls._of(session, c)
-
-    @classmethod
-    def room(cls, seed: int) -> "_Watched":
-        """Calibrate a simulated room and find its edges, without those at the board."""
-        room = furnished_room("rlfs", seed)
-        return cls._of(room.session, room.calibrate())
-
-    @classmethod
-    def _of(cls, session: Session, c: Calibration) -> "_Watched":
-        samples, finder = _samples(session, c), BoardFinder(session.rig)
+            samples, finder = _samples(session, c), BoardFinder(session.rig)
         views = [
             without_board(
                 build_view(session.rig, c, each.name, each.image, each.scan),
@@ -105,12 +93,10 @@ _Part = tuple[_Watched, list[OutlineView]]
 
 
 def bench_scene(n_splits: int, only: str = "") -> None:
-    """Print the tables of docs/benchmarks.md; simulated rooms are split once, as one set."""
+    """Tabulate answers of the scene, alone and with boards, to results that hold and to changed ones."""
     sets = [each for each in SETS if each.name in _NAMES and each.is_there and only in each.name]
     watched = {each.name: _Watched.recorded(each) for each in sets}
     parts = {name: own.parts(n_splits) for name, own in watched.items()}
-    if only in "rooms":
-        parts["rooms"] = [part for seed in range(_N_ROOMS) for part in _Watched.room(seed).parts(1)]
     for title, is_alone in (("Scene alone, without the board's edges", True), ("Boards and scene", False)):
         print(f"\n### {title}\n")
         print_head("calibrated on", "watched", "changed by", "trials", "changed", "holds", "cannot tell")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from saved_results import made_calibration, result_file
 
+from benchmarks.measured import measure
 from benchmarks.recordings import RIGS, recordings
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import Calibration
@@ -38,6 +39,7 @@ _CHANGE = np.array([0.2, np.radians(1.0)])  # m, rad
 
 
 TRUSTED_COV = np.diag([0.003] * 3 + [0.0005] * 3) ** 2  # 3 mm, 0.03 deg: trusted extrinsics
+_SIZE = "{:.2f} deg, {:.0f} mm"
 
 
 def bench_scene_estimate(n_trials: int, only: str = "") -> None:
@@ -118,6 +120,9 @@ def _print_errors(
     n_within = int(np.sum((errors[:, 0] < 0.5) & (errors[:, 1] < 0.2))) + n_trials - len(usable)
     n_covered = sum(each.chi2(T) < _CHI2_95 for each in usable)
     states = Counter(each.state for each in found if each.state != "usable")
+    measure(f"scene_estimate.{name}.covered", "{} of {}", n_covered, len(usable))
+    if usable:
+        measure(f"scene_estimate.{name}.error", _SIZE, *_deg_mm(np.median(errors, axis=0)))
     spread = np.array([_sizes(each) for each in usable]).reshape(-1, 2)
     print_row(
         name,
@@ -137,7 +142,11 @@ def _sizes(estimate: SceneEstimate) -> tuple[float, float]:
 
 
 def _size(pair: Array) -> str:
-    return f"{pair[0]:.2f} deg, {1000 * pair[1]:.0f} mm"
+    return _SIZE.format(*_deg_mm(pair))
+
+
+def _deg_mm(pair: Array) -> tuple[float, float]:
+    return float(pair[0]), 1000 * float(pair[1])
 
 
 def _print_changes(
@@ -148,6 +157,9 @@ def _print_changes(
     unchanged = [watch_scene(views, lens, c) for views in triples]
     noticed = np.median([each.smallest for each in unchanged], axis=0)
     print_row(name, "nothing", len(triples), *_answers(unchanged), _size(noticed))
+    _measure_answers(f"{name}.unchanged", _answers(unchanged))
+    measure(f"scene_estimate.{name}.smallest", _SIZE, *_deg_mm(noticed))
+    changed = np.zeros(3, dtype=int)
     for part, label in enumerate(("20 cm", "1 deg")):
         found = []
         for k in range(n_trials):
@@ -157,6 +169,14 @@ def _print_changes(
             deployed = made_calibration(perturb(T, tangent), TRUSTED_COV)
             found.append(watch_scene(triples[k % len(triples)], lens, deployed))
         print_row(name, f"{label}, any direction", len(found), *_answers(found), "")
+        changed += _answers(found)
+    _measure_answers(f"{name}.changed", changed.tolist())
+
+
+def _measure_answers(key: str, counts: Sequence[int]) -> None:
+    for what, n in zip(("holds", "changes", "unknown"), counts, strict=True):
+        measure(f"scene_estimate.{key}.{what}", "{}", n)
+    measure(f"scene_estimate.{key}.trials", "{}", sum(counts))
 
 
 def _answers(found: Sequence[SceneDrift]) -> tuple[int, int, int]:

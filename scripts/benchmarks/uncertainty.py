@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from benchmarks.measured import DEG_MM, measure
 from benchmarks.profile_errors import with_profile_errors
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
@@ -137,13 +138,18 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
         if only in case.label:
             runs = list(_runs(case, n_seeds, folder, n_captures))
             print_row(case.label, len(runs), n_captures, *_cells(runs))
+            key = f"uncertainty.{case.label}.exact"
+            _measure(key, runs)
+            measure(f"{key}.bound", DEG_MM, *_sizes(np.mean([run.bound for run in runs], axis=0)))
 
     print("\nLiDARs without rings, and two LiDARs to each other\n")
     print_head("LiDAR", *head.split(", ")[1:4], *head.split(", ")[-2:], "95 % regions hold")
     others = {case.label: _runs_without_rings(case, n_seeds, folder, n_captures) for case in WITHOUT_RINGS}
     for label, errors in {**others, _TWO: _runs_of_lidars(n_seeds, n_captures)}.items():
         if only in label:
-            print_row(label, n_seeds, n_captures, *_claim_cells(list(errors)))
+            found = list(errors)
+            print_row(label, n_seeds, n_captures, *_claim_cells(found))
+            _measure(f"uncertainty.{label}", found)
 
     print("\nProfiles in error as their standard deviations say\n")
     print_head(
@@ -156,9 +162,21 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
             verdicts = Counter(run.verdict for run in own)
             counts = ", ".join(str(verdicts[verdict]) for verdict in ("pass", "marginal", "fail"))
             beyond = sum(nees_of(run) > chi2.ppf(_THREE_SIGMAS, _FREEDOMS) for run in own)
-            point = f"{rms([run.point_px for run in own]):.2f}, {rms([run.claimed_px for run in own]):.2f}"
-            cells = (*_claim_cells(own), beyond, point, counts)
+            point = rms([run.point_px for run in own]), rms([run.claimed_px for run in own])
+            cells = (*_claim_cells(own), beyond, "{:.2f}, {:.2f}".format(*point), counts)
             print_row(case.label, method, len(own), n_captures, *cells)
+            key = f"uncertainty.{case.label}.{method}"
+            _measure(key, own)
+            measure(f"{key}.point", "{:.2f} px ({:.2f} px reported)", *point)
+
+
+def _measure(key: str, runs: Sequence[Run]) -> None:
+    nees = np.array([nees_of(run) for run in runs])
+    measure(f"{key}.sessions", "{}", len(runs))
+    measure(f"{key}.rms", DEG_MM, *_rms(runs))
+    measure(f"{key}.claim", DEG_MM, *_sizes(np.mean([run.cov for run in runs], axis=0)))
+    measure(f"{key}.nees", "{:.1f}", nees.mean())
+    measure(f"{key}.regions", "{:.0f} %", 100 * np.mean(nees < chi2.ppf(0.95, _FREEDOMS)))
 
 
 def _cells(runs: list[BoundedRun]) -> Iterator[str]:

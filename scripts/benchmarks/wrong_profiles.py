@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 
+from benchmarks.measured import measure
 from benchmarks.profile_errors import draw_session
 from benchmarks.still_sessions import still_session
 from benchmarks.tables import print_head, print_row, rms
@@ -62,7 +63,10 @@ def bench_wrong_profiles(n_seeds: int, folder: Path, n_captures: int = 16) -> No
                 (np.degrees(np.sqrt(np.trace(cov[3:, 3:]))), 1e3 * np.sqrt(np.trace(cov[:3, :3]))),
             )
             cells = [f"{deg:.2f} / {mm:.1f}" for deg, mm in sizes]
+            for what, size in zip(("rms", "claim"), sizes, strict=True):
+                measure(f"wrong_profiles.{label}.{method}.{what}", "{:.2f} deg, {:.1f} mm", *size)
             counts = ", ".join(str(verdicts[verdict]) for verdict in get_args(Verdict))
+            measure(f"wrong_profiles.{label}.{method}.verdicts", "{}", counts)
             print_row(label, method, *cells, f"{np.mean(chi2):.1f}", f"{max(chi2):.1f}", counts)
 
 

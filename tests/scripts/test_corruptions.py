@@ -18,8 +18,9 @@ from benchmarks.corruption_detections import (
 )
 from benchmarks.corruption_draws import draw_halves, print_draws
 from benchmarks.corruption_kinds import SOUND, corruptions
-from benchmarks.corruption_outcomes import Outcome, print_causes
+from benchmarks.corruption_outcomes import Outcome, measure_causes, print_causes
 from benchmarks.corruption_sessions import Samples, some_of
+from benchmarks.measured import MEASURED
 
 from lce_rig.calibrate.findings import FEW_AGREE, OUTLIER
 from lce_rig.core.errors import NotEnoughDataError, ProfileError
@@ -195,6 +196,23 @@ def test_causes_table_counts_right_and_second_ones(capsys):
     )
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| ml | 2"))
     assert row == "| ml | 2 | 1 (50 %) | 1 (50 %) | 0 (0 %) | 0 | 1 | 1 (100 %) | 1 | 0 (0 %) |"
+
+
+def test_measured_causes_count_mistakes_beyond_tolerance():
+    expected = frozenset({"verdict.scale"})
+    measure_causes(
+        [
+            outcome(SOUND, "", verdict="pass"),
+            outcome("squares", "verdict.scale", expected=expected),
+            outcome("squares", "verdict.moved", expected=expected),
+            outcome("focal length", "verdict.moved", expected=expected, is_beyond=False),
+        ]
+    )
+    (session,) = {key.split(".")[1] for key in MEASURED if key.startswith("corruptions.")}
+    figures = {
+        name: MEASURED[f"corruptions.{session}.ml.{name}"][0] for name in ("mistakes", "right", "passes")
+    }
+    assert figures == {"mistakes": [2], "right": [1, 50.0], "passes": [0]}
 
 
 def test_outcome_faults_of_a_recording_are_not_false():
