@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
+from lce_rig.calibrate.likelihood.hypothesis import Hypothesis, at_full_weight
 from lce_rig.calibrate.likelihood.layout import Indices
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
 from lce_rig.core.findings import Finding, Severity
@@ -42,28 +42,37 @@ _USUAL = 2.0
 _CHANCE = 1e-3
 
 
+def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
+    """Weigh all captures of an estimate fully, to test what may explain them; None if they are too few.
+
+    Args:
+        estimate: of any method.
+        rejected: captures with the board in both sensors that the estimate does not use.
+    """
+    if estimate.joint is None or len(estimate.observations) < _FEWEST:
+        return None
+    joint, camera = estimate.joint
+    seen = sorted([*estimate.observations.values(), *rejected], key=lambda o: o.capture)
+    lenses = [estimate.lens]
+    if joint.state.layout.base is not None:
+        lenses.append(estimate.lens_of_base)
+    return at_full_weight(joint, seen, lenses, camera)
+
+
 def find_causes(
+    hypothesis: Hypothesis,
     estimate: CalibrationEstimate,
-    rejected: Sequence[Observation],
     target: CalibrationSettings,
     causes: Sequence[Cause],
 ) -> tuple[Selected, ...]:
     """Find errors that explain the captures of an estimate better than noise, up to the first reason.
 
     Args:
+        hypothesis: the likelihood of its captures.
         estimate: of any method.
-        rejected: captures with the board in both sensors that the estimate does not use.
         target: target standard deviations.
         causes: to test; only mountings for two LiDARs, or two cameras.
     """
-    if estimate.joint is None or len(estimate.observations) < _FEWEST:
-        return ()
-    joint, camera = estimate.joint
-    seen = sorted([*estimate.observations.values(), *rejected], key=lambda o: o.capture)
-    lenses = [estimate.lens]
-    if joint.state.layout.base is not None:
-        lenses.append(estimate.lens_of_base)
-    hypothesis = at_full_weight(joint, seen, lenses, camera)
     found: list[Selected] = []
     for selected in explain(hypothesis, causes):
         found.append(_in_use(selected, estimate))

@@ -170,10 +170,13 @@ class Poses(NamedTuple):
 
     def gain(self, explanation: Explanation, unit: float = 1.0) -> Gain:
         """Compute (2) for a change of the extrinsics, in units of the captures' noise."""
-        w = explanation.weights
-        by_z = np.tensordot(w, self.by_z, axes=1)
-        hessian = np.tensordot(w**2, self.hessian, axes=1)
-        return _gain(explanation, w @ self.gradient, hessian - by_z.T @ self.inverse @ by_z, _ANY, unit)
+        return _gain(explanation, *self.score(explanation.weights), _ANY, unit)
+
+    def score(self, weights: Array) -> tuple[Array, Array]:
+        """Compute h (6,) and S (6, 6) of (2) for a change of the extrinsics with weights (F,)."""
+        by_z = np.tensordot(weights, self.by_z, axes=1)
+        hessian = np.tensordot(weights**2, self.hessian, axes=1)
+        return weights @ self.gradient, hessian - by_z.T @ self.inverse @ by_z
 
     def singles(self, gradient: Array) -> Array:
         """Compute the fall of each capture's cost (F,) with extrinsics of its own: chi-squared, 6 freedoms.

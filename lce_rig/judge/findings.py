@@ -276,10 +276,16 @@ def _moved(finding: Finding) -> str:
     others show that it did.
     """
     place = finding.figures["place"]
-    text = fill("{n_captures} captures ({captures:few}) fit a mounting changed by " + _APART, finding.figures)
+    one = (
+        "{captures:few} fits"
+        if finding.figures["n_captures"] == 1
+        else "{n_captures} captures ({captures:few}) fit"
+    )
+    text = fill(one + " a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
     cameras = f"{finding.subject} in their images: " if finding.subject else ""
-    which = f"the {place} " if place else ""
+    which = f"the {place} " if place and finding.figures["n_captures"] != 1 else ""
+    which = which or ("capture " if finding.figures["n_captures"] == 1 else "")
     sensor = finding.figures.get("sensor") or "a sensor"
     return f"{cameras}{which}{text}: {sensor} moved {fill(when, finding.figures)}"
 

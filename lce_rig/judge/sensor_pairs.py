@@ -8,7 +8,7 @@ LiDAR have as well.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,6 @@ from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
     Array,
@@ -42,7 +41,6 @@ from lce_rig.judge.findings import (
     LIDARS_UNNAMED,
     MOVED,
     OTHER_MODEL,
-    causes_of,
     failing,
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
@@ -384,31 +382,3 @@ def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
             " and ".join(lidars), severity=failing(excess > FAIL_FACTOR), camera=camera, **apart.sizes
         )
     ]
-
-
-def name_moved(calibrations: Sequence[Calibration]) -> list[Calibration]:
-    """Name the sensor that moved: the one that all pairs with another mounting share, and no other pair has.
-
-    Args:
-        calibrations: of all pairs of a rig.
-    """
-    moved = {
-        k for k, c in enumerate(calibrations) if any(f.code == MOVED.code for f in causes_of(c.findings))
-    }
-    pairs = [{c.camera, c.lidar} for c in calibrations]
-    of_all = set.intersection(*(pairs[k] for k in moved)) if len(moved) > 1 else set()
-    sound = set().union(*(pair for k, pair in enumerate(pairs) if k not in moved))
-    suspects = of_all - sound
-    if len(suspects) != 1:
-        return list(calibrations)
-    (sensor,) = suspects
-    return [
-        replace(c, findings=tuple(_moved_by(f, sensor) for f in c.findings)) if k in moved else c
-        for k, c in enumerate(calibrations)
-    ]
-
-
-def _moved_by(finding: Finding, sensor: str) -> Finding:
-    if finding.code != MOVED.code or finding.subject:
-        return finding
-    return replace(finding, figures={**finding.figures, "sensor": sensor})

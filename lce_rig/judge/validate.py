@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.judge.causes import cause_findings, contradiction_of, find_causes, is_explained
+from lce_rig.judge.causes import cause_findings, contradiction_of, find_causes, hypothesis_of, is_explained
 from lce_rig.judge.contributions import (
     channels_contradict,
     list_contributions,
@@ -34,6 +35,7 @@ class Validation:
         is_explained: whether they leave no more than about the usual noise.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
         lens_model: finding of a lens model in the profile that does not fit the corners.
+        hypothesis: the likelihood of all captures; None if they are too few to test.
     """
 
     cov: Array
@@ -44,6 +46,7 @@ class Validation:
     is_explained: bool
     intrinsics: IntrinsicsCheck | None
     lens_model: Sequence[Finding]
+    hypothesis: Hypothesis | None = None
 
 
 def validate(
@@ -68,7 +71,8 @@ def validate(
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
     intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)
-    selected = find_causes(estimate, rejected, rig.calibration, tested)
+    hypothesis = hypothesis_of(estimate, rejected)
+    selected = () if hypothesis is None else find_causes(hypothesis, estimate, rig.calibration, tested)
     causes = cause_findings(selected, estimate, rig, camera, lidar)
     contradictions = [
         *contradiction_of(selected, causes, estimate.used),
@@ -85,4 +89,5 @@ def validate(
         is_explained=is_explained(selected),
         intrinsics=intrinsics,
         lens_model=[] if fitted is None or lens is None else model_findings(fitted, board),
+        hypothesis=hypothesis,
     )

@@ -37,6 +37,7 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.export.extrinsics import Reference
 from lce_rig.judge.findings import EXCHANGED, lacks_captures
+from lce_rig.judge.moved_sensor import MovedSensor, PairCosts, find_moved_sensor, with_motion
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
     CameraEvidence,
@@ -45,7 +46,6 @@ from lce_rig.judge.sensor_pairs import (
     camera_findings,
     find_exchanged_cameras,
     loop_findings,
-    name_moved,
     relate,
 )
 from lce_rig.judge.session_check import find_meetings
@@ -103,6 +103,11 @@ class _Solved:
         """Whether boards stood still, so that images need no motion compensation."""
         return all(channel.time_offset_s is None for channel in self.estimate.channels)
 
+    @property
+    def costs(self) -> PairCosts:
+        """What the captures say of a motion of either sensor."""
+        return PairCosts.of((self.camera, self.lidar), self.estimate, self.validation)
+
     def evidence(self, detections: Detections) -> CameraEvidence:
         """List what shows whether the images are of this camera, with its boards in the captures used."""
         channels = [channel.channel for channel in self.estimate.channels]
@@ -130,6 +135,10 @@ class _Link(NamedTuple):
     pair: CameraPair | None
     contradictions: list[Finding]
     exchanged: list[Finding]
+
+    def sensors(self, solved: Sequence[_Solved]) -> set[str]:
+        """Name both cameras and their LiDAR."""
+        return {name for k in self.members for name in (solved[k].camera, solved[k].lidar)}
 
 
 def calibrate_session(
@@ -253,8 +262,17 @@ def calibrate_detections(
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
     if len(alone) + len(between) > 1:
         begin(progress, "comparing and joining sensors")
+    moved = find_moved_sensor([own.costs for own in alone] + [own.costs for own in between])
     links, loops = _compare(rig, detections, alone), _open_loops(rig, alone, between)
-    solved, between = _solve_together(rig, detections, alone, between, links, loops)
+    if moved is not None:
+        # What its pairs contradict follows from its motion.
+        links = [
+            link._replace(contradictions=[]) if moved.name in link.sensors(alone) else link for link in links
+        ]
+        loops = [(loop, finding) for loop, finding in loops if moved.name not in loop.names]
+    solved, between = _solve_together(rig, detections, alone, between, links, loops, moved)
+    solved = [replace(own, validation=with_motion(own.validation, own.costs, moved)) for own in solved]
+    between = [replace(own, validation=with_motion(own.validation, own.costs, moved)) for own in between]
     named = [(own.names, finding) for own in between for finding in find_named(rig, detections, own)]
     calibrations = [_judged(rig, detections, solved, links, loops, named, k) for k in range(len(solved))]
     for own in between:
@@ -263,7 +281,7 @@ def calibrate_detections(
         calibrations.append(judged_peers(rig, own, others))
     if cameras is None and channels is None:
         shortages += _unconnected(rig, detections, calibrations)
-    return name_moved(calibrations), shortages
+    return calibrations, shortages
 
 
 def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:
@@ -439,6 +457,7 @@ def _solve_together(
     between: Sequence[SolvedPeers],
     links: Sequence[_Link],
     loops: Sequence[tuple[Loop, Finding]],
+    moved: MovedSensor | None,
 ) -> tuple[list[_Solved], list[SolvedPeers]]:
     """Estimate sensors that agree as one; leave the others unchanged.
 
@@ -458,6 +477,9 @@ def _solve_together(
         if own.settings.method == "ml" and own.is_still and _is_sound(own.validation)
     }
     lidars = {own.names: own for own in between if _is_sound(own.validation)}
+    if moved is not None:
+        costs = [own.costs for own in alone] + [own.costs for own in between]
+        excluded |= {pair.sensors for pair in costs if moved.is_within(pair)}
     sound = (cameras.keys() | lidars.keys()) - excluded
     solved, solved_lidars = list(alone), list(between)
     for pairs in _connected(sound):

@@ -24,6 +24,7 @@ from lce_rig.core.progress import Progress, begin
 from lce_rig.core.results import Observation, PatternBoard
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.explanations import MOUNTINGS
+from lce_rig.judge.moved_sensor import PairCosts
 from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model
 from lce_rig.judge.session_check import match_candidates
 from lce_rig.judge.validate import Validation, validate
@@ -67,6 +68,11 @@ class SolvedPeers:
     def T_first_second(self) -> Array:
         """(4, 4) pose of the second sensor in the first one's frame."""
         return np.asarray(invert(self.T_view) @ self.estimate.T_cam_lidar)
+
+    @property
+    def costs(self) -> PairCosts:
+        """What the captures say of a motion of either sensor."""
+        return PairCosts.of(self.names, self.estimate, self.validation, self.T_view)
 
     @property
     def to_first(self) -> Array:

@@ -91,19 +91,19 @@ def make_rig(sensors=SENSORS, seed=None):
     )
 
 
-def between(first, second):
+def between(first, second, poses=ON_FRONT):
     """True pose (4, 4) of the second sensor in the first one's frame."""
-    return ON_FRONT[first] @ invert(ON_FRONT[second])
+    return poses[first] @ invert(poses[second])
 
 
-def error(result):
+def error(result, poses=ON_FRONT):
     """Error (6,) of a result, used with the lenses that belong to it."""
     T = result.T_cam_lidar
     if result.intrinsics is not None:
         T = in_use(T, result.intrinsics)
     if result.lidar_intrinsics is not None:
         T = invert(in_use(invert(T), result.lidar_intrinsics))
-    return difference(T, between(result.camera, result.lidar))
+    return difference(T, between(result.camera, result.lidar, poses))
 
 
 def measure_errors(results):

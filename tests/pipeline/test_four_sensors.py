@@ -67,6 +67,17 @@ def test_exchanged_lidars_are_named_in_all_pairs():
         assert len(texts) == 1 and "front and rear are exchanged" in texts[0]
 
 
+def test_sensor_that_moved_is_named_where_a_pair_saw_little_of_it():
+    """The two cameras have one and two captures from before the motion of `rear`."""
+    after = perturb(ON_FRONT["rear"], np.r_[0.012, -0.004, 0.016, np.radians([0.5, 0.6, -0.6])])
+    results = calibrate(simulate(N, 6, moves={"rear": lambda k: ON_FRONT["rear"] if k < 8 else after}))
+    for pair, texts in causes(results).items():
+        if "rear" in pair:
+            assert "rear moved before 000010" in texts[0]
+        else:
+            assert results[pair].verdict == "pass"
+
+
 @pytest.mark.slow
 def test_four_sensors_claims_cover_errors_of_many_sessions():
     """50 sessions of 30 placements, each seen by two or three of four sensors; profiles err as they state."""
@@ -79,49 +90,56 @@ def test_four_sensors_claims_cover_errors_of_many_sessions():
 
 
 def wrong_sessions(seed):
-    """List sessions in which one sensor is wrong: kind, sensors, words of the cause, profile, detections."""
+    """List sessions in which one sensor is wrong.
+
+    Each is (kind, sensors, words of the cause, profile, detections, poses after a motion).
+    """
     rng = np.random.default_rng(seed)
     for name in ON_FRONT:
         turn = exp_so3(rng.normal(size=3))[:, 0]
         after = perturb(ON_FRONT[name], np.r_[0.01 * rng.normal(size=3), np.radians(1.0) * turn])
         cut = int(rng.integers(N // 4, 3 * N // 4))
         moves = {name: lambda k, name=name, cut=cut, after=after: ON_FRONT[name] if k < cut else after}
-        yield f"{name} moved", {name}, f"{name} moved", RIG, simulate(N, seed, moves=moves)
+        poses = {**ON_FRONT, name: after}
+        yield f"{name} moved", {name}, f"{name} moved", RIG, simulate(N, seed, moves=moves), poses
     found = simulate(N, seed)
     front, rear = found.lidars["front"], found.lidars["rear"]
     exchanged = Detections(found.images, {"front": rear, "rear": front})
-    yield "LiDARs exchanged", {"front", "rear"}, "exchanged", RIG, exchanged
+    yield "LiDARs exchanged", {"front", "rear"}, "exchanged", RIG, exchanged, ON_FRONT
     left, right = (found.images[name, "frames"] for name in ("left", "right"))
     exchanged = Detections({("left", "frames"): right, ("right", "frames"): left}, found.lidars)
-    yield "cameras exchanged", {"left", "right"}, "exchanged", RIG, exchanged
+    yield "cameras exchanged", {"left", "right"}, "exchanged", RIG, exchanged, ON_FRONT
     lens = RIG.cameras["right"].intrinsics
     longer = lens.model_copy(update={"fx_px": 1.02 * lens.fx_px, "fy_px": 1.02 * lens.fy_px})
     camera = RIG.cameras["right"].model_copy(update={"intrinsics": longer})
     rig = RIG.model_copy(update={"cameras": {**RIG.cameras, "right": camera}})
-    yield "focal length of right 2 % too long", {"right"}, "intrinsics", rig, found
+    yield "focal length of right 2 % too long", {"right"}, "intrinsics", rig, found, ON_FRONT
 
 
 @pytest.mark.slow
 def test_wrong_sensor_is_named_first_in_many_sessions():
-    """10 sessions of each kind: the cause of all pairs of the sensor, none of others, and no wrong pass."""
+    """10 sessions of each kind: the cause of all pairs of the sensor, none of others, and no wrong pass.
+
+    A result that passes is within its claim, and a note names the sensor: boards correct a wrong lens, and
+    captures from after a motion are not affected.
+    """
     right: dict[str, list[bool]] = {}
     wrong_passes = 0
     for seed in range(10):
-        for kind, sensors, text, rig, found in wrong_sessions(seed):
+        for kind, sensors, text, rig, found, poses in wrong_sessions(seed):
             results, _ = calibrate_detections(rig, found)
             is_right = []
             for c in results:
-                causes_here = [f for f in c.findings if f.severity != "note" and not f.follows]
                 if {c.camera, c.lidar} & sensors:
-                    is_right.append(bool(causes_here) and text in causes_here[0].text)
-                    off = error(c)
-                    is_off = off @ np.linalg.solve(c.cov, off) > 30
-                    wrong_passes += "focal" not in kind and c.verdict == "pass" and bool(is_off)
+                    named = [f for f in c.findings if not f.follows]
+                    is_right.append(bool(named) and text in named[0].text)
+                    off = error(c, poses)
+                    wrong_passes += c.verdict == "pass" and bool(off @ np.linalg.solve(c.cov, off) > 30)
                 else:
                     is_right.append(c.verdict == "pass")
             right.setdefault(kind, []).append(all(is_right))
     for kind, found in right.items():
         print(f"{kind}: named in all its pairs and in no other in {sum(found)} of {len(found)} sessions")
     print(f"pairs that pass beyond 95 % five times over: {wrong_passes}")
-    assert np.mean([each for found in right.values() for each in found]) > 0.8
+    assert np.mean([each for found in right.values() for each in found]) > 0.9
     assert not wrong_passes
