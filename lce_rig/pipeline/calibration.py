@@ -53,7 +53,14 @@ from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect_boards
-from lce_rig.pipeline.findings import FEW_DETECTED, LIDAR_ABSENT, SHORTAGE, UNCONNECTED, few_detected
+from lce_rig.pipeline.findings import (
+    FEW_DETECTED,
+    LIDAR_ABSENT,
+    SHORTAGE,
+    UNCONNECTED,
+    absent_channels,
+    few_detected,
+)
 from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
     find_named,
@@ -219,11 +226,14 @@ def calibrate_detections(
     alone: list[_Solved] = []
     shortages: list[Finding] = []
     groups = _pairs_by_sensors(detections, cameras, channels)
+    absent = [replace(each, severity="note") for each in absent_channels(rig, detections, channels)]
     shared = _shared_lenses(rig, detections, groups)
     for pairs in groups:
         lens = shared.get(pairs[0].camera)
         try:
-            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress))
+            solved_alone = _solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress)
+            own = [each for each in absent if each.subject.startswith(f"{solved_alone.camera}.")]
+            alone.append(replace(solved_alone, lacking=(*solved_alone.lacking, *own)))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
