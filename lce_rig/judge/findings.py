@@ -28,7 +28,14 @@ _SYMPTOMS = frozenset(
 _UNCERTAIN = frozenset(("verdict.rotation_uncertain", "verdict.translation_uncertain"))
 _OF_SIZES = frozenset(("verdict.scale", "verdict.range_offset", "verdict.range_scale"))
 _PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
-_FIRST = ("association", "verdict.exchanged", "verdict.lens_model", "verdict.readout", "verdict.intrinsics")
+_FIRST = (
+    "association",
+    "verdict.exchanged",
+    "verdict.lens_model",
+    "verdict.readout",
+    "verdict.intrinsics",
+    "verdict.time_offset",
+)
 """Causes that precede others of their severity, as they are detected without an estimate."""
 _LACKS = {
     ("verdict.few_placements", ""),
@@ -109,7 +116,9 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
         if cause is None or finding is cause or finding.severity == "note":
             return ""
         is_symptom = finding.code in _SYMPTOMS or (finding.code in _UNCERTAIN and finding.action == "resolve")
-        return cause.code if is_symptom else ""
+        # Images at wrong times of a moving board scatter.
+        is_of_times = (cause.code, finding.code) == ("verdict.time_offset", "verdict.scatter")
+        return cause.code if is_symptom or is_of_times else ""
 
     placed = [replace(f, follows=follows(f)) for f in findings if f is not cause]
     # Sizes of the plate that follow from a note are notes.

@@ -24,6 +24,8 @@ from lce_rig.judge.findings import (
     RANGE_OFFSET,
     ROTATION_UNCERTAIN,
     SCALE_OFF,
+    SCATTERED,
+    TIME_OFFSET,
     arrange,
     causes_of,
 )
@@ -270,6 +272,15 @@ def test_arrange_sigmas_follow_a_contradiction_only(action, follows):
     sigma = ROTATION_UNCERTAIN(severity="warning", action=action, **figures)
     listed = arrange([sigma, squares_off("warning")])
     assert [f.follows for f in listed if f.code == sigma.code] == [follows]
+
+
+def test_arrange_scatter_follows_late_timestamps():
+    figures = {"channel": "events", "offset_s": -0.3, "sigma_s": 0.01, "enter_s": -0.3}
+    late = TIME_OFFSET("davis", severity="warning", **figures)
+    listed = arrange([SCATTERED(ratio=4.0), late])
+    assert [(f.code, f.follows) for f in listed] == [(late.code, ""), ("verdict.scatter", late.code)]
+    slightly = replace(late, severity="note")
+    assert [f.code for f in arrange([SCATTERED(ratio=4.0), slightly])] == ["verdict.scatter", late.code]
 
 
 @pytest.mark.parametrize(("severity", "plate"), [("error", "warning"), ("note", "note")])
