@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.core.calibration import Certificate
+from lce_rig.core.calibration import Certificate, ChannelResult
 from lce_rig.core.findings import KINDS, Finding, Refusal
-from lce_rig.core.geometry import difference, invert, perturb
+from lce_rig.core.geometry import PoseDifference, difference, invert, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
     INTRINSICS,
@@ -272,6 +272,15 @@ def test_arrange_sigmas_follow_a_contradiction_only(action, follows):
     sigma = ROTATION_UNCERTAIN(severity="warning", action=action, **figures)
     listed = arrange([sigma, squares_off("warning")])
     assert [f.follows for f in listed if f.code == sigma.code] == [follows]
+
+
+def test_channels_rotated_by_180_deg_are_the_cause(estimate, verdict_of):
+    channels = tuple(ChannelResult(name, 20, 0.2, -0.3, 0.05) for name in ("frames", "frames"))
+    turned = PoseDifference(np.array([0.1, 0, 0, 0, 0, np.pi]), 1e-6 * np.eye(6))
+    verdict, listed = verdict_of(replace(estimate, channels=channels, channel_difference=turned))
+    assert verdict == "fail" and [f.code for f in causes_of(listed)][:1] == ["verdict.channels_turned"]
+    follows = {f.code: f.follows for f in listed}
+    assert follows["verdict.channels_differ"] == follows["verdict.time_offset"] == "verdict.channels_turned"
 
 
 def test_arrange_scatter_follows_late_timestamps():
