@@ -24,7 +24,7 @@ from lce_rig.calibrate.observations import board_key, group_poses
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
 from lce_rig.calibrate.session_lens import SessionLens
-from lce_rig.calibrate.uncertainty import widen, with_errors, without_lidar
+from lce_rig.calibrate.uncertainty import widen, with_corrected_planes, with_errors, without_lidar
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
@@ -266,7 +266,10 @@ def _report(
     if is_of_cameras:
         figures = without_lidar(figures)
         moves = tuple(each for each in moves if each.source in _OF_CAMERAS)
-    return replace(report(start, T, cov, board, figures), method="ml", sensitivities=moves)
+    estimate = report(start, T, cov, board, figures)
+    if not (is_of_cameras or is_of_lidars):
+        estimate = with_corrected_planes(estimate, board, part.scans.rings, part.state)
+    return replace(estimate, method="ml", sensitivities=moves)
 
 
 class _Known(NamedTuple):

@@ -5,16 +5,31 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.layout import SHIFTS, State
 from lce_rig.calibrate.likelihood.levels import Levels
+from lce_rig.calibrate.likelihood.rays import correct_points
 from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
-from lce_rig.calibrate.plane_and_ends import differentiate, end_rows, extract_features
+from lce_rig.calibrate.plane_and_ends import (
+    differentiate,
+    end_rows,
+    extract_features,
+    plane_residuals,
+)
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
-from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity, Start, report, with_parts
+from lce_rig.calibrate.result import (
+    CalibrationEstimate,
+    Sensitivity,
+    Start,
+    report,
+    squares_scale,
+    with_parts,
+    with_squares,
+)
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
@@ -211,7 +226,7 @@ def by_likelihood(
     figures = with_parts(figures, scatter, constants)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
     return replace(
-        estimate,
+        with_corrected_planes(estimate, board, joint.terms.scans.rings, joint.state),
         method="ml",
         sensitivities=tuple(Sensitivity(name, 1.0, (J @ moves).T) for name, moves in joint.moves.items()),
         lens=lens,
@@ -251,6 +266,26 @@ def with_errors(
         noise_depth_m=levels.depth_m,
         noise_across_m=levels.across_m,
     )
+
+
+def with_corrected_planes(
+    estimate: CalibrationEstimate, board: Board, rings: NDArray[np.int16], state: State
+) -> CalibrationEstimate:
+    """Add the mean plane error of the points without the LiDAR's estimated constant errors.
+
+    Args:
+        estimate: of a camera and a LiDAR.
+        board: its size.
+        rings: (L,) ring numbers of the state's lasers.
+        state: the errors.
+    """
+    scale, means_m = squares_scale(estimate.diagnostics), []
+    for observation in estimate.observations.values():
+        features = extract_features(with_squares(observation, scale), board, half_step=False)
+        points = correct_points(observation.lidar, board, rings, state)
+        means_m.append(np.abs(plane_residuals(features, estimate.T_cam_lidar, points)).mean())
+    figures = replace(estimate.diagnostics, mpe_corrected_m=float(np.mean(means_m)))
+    return replace(estimate, diagnostics=figures)
 
 
 def without_lidar(figures: Diagnostics) -> Diagnostics:

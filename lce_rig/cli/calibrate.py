@@ -27,7 +27,7 @@ from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
 from lce_rig.pipeline.detect_session import unlike_models
-from lce_rig.pipeline.findings import FEW_DETECTED, absent_channels
+from lce_rig.pipeline.findings import CHANNEL_REJECTED, FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -207,6 +207,8 @@ def calibrate(
     for finding in (finding for c in result.pairs for finding in c.findings):
         if finding.code == FEW_DETECTED.code:
             show.warn("\n  ".join(map(str.strip, str(NotEnoughDataError.of(finding)).splitlines())))
+        elif finding.code == CHANNEL_REJECTED.code:
+            show.warn(f"{finding.text}: {finding.advice_at(str(session))}")
     if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
         show.warn(f"{reference} has no T_cam_lidar for these sensors")
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.

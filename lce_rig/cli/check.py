@@ -18,7 +18,7 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
-from lce_rig.pipeline.detect_session import association_errors, candidates_of, match_sensors
+from lce_rig.pipeline.detect_session import association_errors, candidates_of, match_sensors, unlike_models
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
@@ -41,6 +41,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect_boards(opened, progress=progress)
+    show.warn_of(unlike_models(opened, detections))
     if debug_images:
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, progress=progress)

@@ -178,7 +178,7 @@ def _show_standing(state: TargetState, target: TargetSettings, *, as_json: bool)
     for kept in state.releases:
         mark = " *" if kept.name == current.name else ""
         cells = (f"{kept.name}{mark}", kept.time, kept.by, kept.robot or "-", kept.date[:10] or "-")
-        rows.append(map(show.escape, map(show.harmless, cells)))
+        rows.append(map(show.escape, cells))
     headings = ("release", "deployed", "by", "robot", "captures of")
     show.print_table(show.plain_table("", *headings, rows=rows))
     _warn_of_changes(state.changed)

@@ -185,7 +185,8 @@ def table(registry: str, where: str, columns: list[str] | None, as_json: bool, r
     else:
         shown = chosen.slice(0, _MOST_SHOWN).to_pylist()
         rows = [map(_cell, row.values()) if columns else _summary(row) for row in shown]
-        show.print_table(show.plain_table("", *(chosen.column_names if columns else _HEADINGS), rows=rows))
+        headings = map(show.escape, chosen.column_names) if columns else _HEADINGS
+        show.print_table(show.plain_table("", *headings, rows=rows))
         is_whole = len(chosen) == len(rows)
         count = show.counted(len(chosen), "row")
         show.note(count if is_whole else f"{len(rows)} of {count}; --json prints all")

@@ -227,10 +227,10 @@ def harmless(text: str) -> str:
 
 
 def escape(text: str) -> str:
-    """Keep rich from reading brackets in names as markup."""
+    """Keep rich from reading brackets in names as markup, and the terminal from obeying them."""
     from rich.markup import escape as escape_markup
 
-    return escape_markup(text)
+    return escape_markup(harmless(text))
 
 
 def print_parts(parts: Iterable[Any]) -> None:

@@ -162,6 +162,7 @@ class Diagnostics:
     edge_shift_blended_echo_m: float = math.nan
     covariance_inflation: float = math.nan  # of the joint estimate's covariance, from leave-one-out results
     range_offset_m: float = math.nan  # mean over lasers of their range errors
+    mpe_corrected_m: float = math.nan  # Metrics.mpe_m without the LiDAR's estimated constant errors
     laser_spread_m: float = math.nan  # standard deviation of these
     lens_vertical_m_per_rad: float = math.nan  # displacement of the LiDAR's lens
     camera_scale: float = math.nan  # of the camera's distances

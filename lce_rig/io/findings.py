@@ -33,7 +33,12 @@ _SKIPPED = "{n_seen} of {n_rings} rings in each direction: points are skipped"
 _EVERY_POINT = "record every point (point_filter_num: 1), or correct lidars.{subject}.model"
 RINGS_SKIPPED = warning_kind("recording.rings_skipped", "{subject}: " + _SKIPPED, _EVERY_POINT)
 LIDAR_RINGS_SKIPPED = Kind("lidar.rings_skipped", _SKIPPED, _EVERY_POINT)
-
+POINTS_SKIPPED = warning_kind(
+    "recording.points_skipped",
+    "{subject}: 1 of {n} returns per ring (azimuth step {step_deg:deg}, model {model_step_deg:deg}): "
+    "points are skipped",
+    "record every point (point_filter_num: 1), or correct lidars.{subject}.{key}",
+)
 
 DAMAGED = warning_kind("packet.damaged", "{n} damaged packets skipped (first: {where})")
 OTHER_MODEL = warning_kind(

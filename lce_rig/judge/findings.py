@@ -1,7 +1,7 @@
 """Kinds of findings against extrinsics and intrinsics: reasons and notes of a verdict."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -28,7 +28,15 @@ _SYMPTOMS = frozenset(
 _UNCERTAIN = frozenset(("verdict.rotation_uncertain", "verdict.translation_uncertain"))
 _OF_SIZES = frozenset(("verdict.scale", "verdict.range_offset", "verdict.range_scale"))
 _PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
-_FIRST = ("association", "verdict.exchanged", "verdict.lens_model", "verdict.readout", "verdict.intrinsics")
+_FIRST = (
+    "association",
+    "verdict.exchanged",
+    "verdict.channels_turned",
+    "verdict.lens_model",
+    "verdict.readout",
+    "verdict.intrinsics",
+    "verdict.time_offset",
+)
 """Causes that precede others of their severity, as they are detected without an estimate."""
 _LACKS = {
     ("verdict.few_placements", ""),
@@ -37,6 +45,11 @@ _LACKS = {
     ("verdict.not_certified", ""),
 }
 """Code and action of findings against which more captures help."""
+# Causes of which some images are at wrong places or times, and findings that these bring about.
+_BROUGHT_ABOUT: Mapping[str, Collection[str]] = {
+    "verdict.channels_turned": ("verdict.time_offset", "verdict.scatter", "verdict.moved", "verdict.drift"),
+    "verdict.time_offset": ("verdict.scatter",),
+}
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _CORNERS_TOO = "hold the board in all four corners of the image, tilted by 30 to 45 deg"
@@ -109,7 +122,8 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
         if cause is None or finding is cause or finding.severity == "note":
             return ""
         is_symptom = finding.code in _SYMPTOMS or (finding.code in _UNCERTAIN and finding.action == "resolve")
-        return cause.code if is_symptom else ""
+        follows_it = finding.code in _BROUGHT_ABOUT.get(cause.code, ())
+        return cause.code if is_symptom or follows_it else ""
 
     placed = [replace(f, follows=follows(f)) for f in findings if f is not cause]
     # Sizes of the plate that follow from a note are notes.
@@ -344,6 +358,11 @@ CHANNELS_DIFFER = Kind(
     "verdict.channels_differ",
     "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
     "each alone: `lce-rig calibrate {session} --channels frames --name frames`",
+)
+CHANNELS_TURNED = Kind(
+    "verdict.channels_turned",
+    "{first} and {second} of one camera are rotated by 180 deg against each other",
+    "turn the images of one of them in its driver, or in the recording",
 )
 SENSORS_DISAGREE = Kind(
     "verdict.sensors_disagree",

@@ -16,6 +16,7 @@ from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
     CHANNELS_DIFFER,
+    CHANNELS_TURNED,
     EDGE_RESIDUAL,
     FAIL_FACTOR,
     FAR_FROM_NOMINAL,
@@ -58,6 +59,8 @@ _LACKING, _DROPPED = 0.3, 0.04
 # Significance limit of a time offset, in standard deviations, and the offset, s, from which images may be
 # matched with other scans.
 _SURE, _LATE_S = 3.0, 0.1
+# Rotation between channels of one camera that an image rotated by 180 deg explains, deg.
+_TURNED_DEG = 170.0
 MAX_PLANE_MISFIT_M = 0.012
 """Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
 reach 20 to 30 mm."""
@@ -264,8 +267,10 @@ def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
     if apart is None or (excess := rig.calibration.excess(apart)) <= 1:
         return []
     first, second = (channel.channel for channel in estimate.channels[:2])
-    severity = failing(excess > FAIL_FACTOR)
-    return [CHANNELS_DIFFER(severity=severity, first=first, second=second, **apart.sizes)]
+    severity, sizes = failing(excess > FAIL_FACTOR), apart.sizes
+    differ = CHANNELS_DIFFER(severity=severity, first=first, second=second, **sizes)
+    is_turned = sizes["rotation_deg"] > _TURNED_DEG
+    return [*([CHANNELS_TURNED(first=first, second=second)] if is_turned else []), differ]
 
 
 def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySettings) -> Iterator[Finding]:

@@ -53,7 +53,15 @@ from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect_boards
-from lce_rig.pipeline.findings import FEW_DETECTED, LIDAR_ABSENT, SHORTAGE, UNCONNECTED, few_detected
+from lce_rig.pipeline.findings import (
+    CHANNEL_REJECTED,
+    FEW_DETECTED,
+    LIDAR_ABSENT,
+    SHORTAGE,
+    UNCONNECTED,
+    absent_channels,
+    few_detected,
+)
 from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
     find_named,
@@ -228,11 +236,14 @@ def calibrate_detections(
     alone: list[_Solved] = []
     shortages: list[Finding] = []
     groups = _pairs_by_sensors(detections, cameras, channels)
+    absent = [replace(each, severity="note") for each in absent_channels(rig, detections, channels)]
     shared = _shared_lenses(rig, detections, groups)
     for pairs in groups:
         lens = shared.get(pairs[0].camera)
         try:
-            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress))
+            solved_alone = _solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress)
+            own = [each for each in absent if each.subject.startswith(f"{solved_alone.camera}.")]
+            alone.append(replace(solved_alone, lacking=(*solved_alone.lacking, *own)))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
@@ -380,13 +391,16 @@ def _solve(
         shortages.append(few_detected(str(pair), len(of_channel), own_refused, n_needed))
     if not candidates:
         raise NotEnoughDataError.of(max(shortages, key=lambda shortage: shortage.figure("n_detected")))
-    lacking = tuple(replace(shortage, severity="note") for shortage in shortages)
     detected = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in detected}
     tolerances = Tolerances.of(rig.cameras[camera], rig.board)
     settings = replace(EstimateSettings.of(options, rig.lidars[lidar], tolerances), lens=lens)
     clocks = Clocks.of(rig, camera, lidar)
     estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
+    kept = {channel.channel for channel in estimate.channels} or set(candidates)
+    rejected = [name for name in candidates if name not in kept]
+    shortages += [CHANNEL_REJECTED(f"{camera}.{name}", channel=name) for name in rejected]
+    lacking = tuple(replace(shortage, severity="note") for shortage in shortages)
     begin(progress, f"checking {camera} and {lidar}")
     validation = _examine(rig, detections, pairs, estimate)
     return _Solved(tuple(pairs), settings, refused, estimate, validation, lacking)

@@ -60,6 +60,12 @@ CHANNEL_ABSENT = warning_kind(
     "collect it, or omit it: `lce-rig calibrate {session} --channels {held}`",
 )
 
+CHANNEL_REJECTED = warning_kind(
+    "shortage.channel_rejected",
+    "{subject}: no image agrees with the scans as the other channels do: the result is without it",
+    "its cause: `lce-rig calibrate {session} --channels {channel} --name {channel}`",
+)
+
 
 def absent_channels(rig: Rig, detections: Detections, wanted: Collection[str] | None) -> list[Finding]:
     """List the channels without a capture, of cameras that have captures by another channel.

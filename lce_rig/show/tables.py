@@ -134,6 +134,7 @@ def _fit_rows(c: Calibration) -> list[Row]:
     rows = [
         ("captures in which both sensors found the board", f"{c.n_detected} of {c.n_captures}"),
         (f"{points} from the board planes of {first}, mean", f"{1000 * c.metrics.mpe_m:.1f} mm"),
+        ("the same without the LiDAR's estimated errors, mean", _without_errors(c)),
         ("ring ends from the board's edges, mean", _if_known(1000 * c.metrics.mee_m, ".1f", "mm")),
         ("held-out captures, mean of their rms", _if_known(1000 * c.diagnostics.held_out_m, ".1f", "mm")),
         (
@@ -145,10 +146,19 @@ def _fit_rows(c: Calibration) -> list[Row]:
     return [row for row in rows if row[1]]
 
 
+def _without_errors(c: Calibration) -> str:
+    """State the plane residual without the LiDAR's estimated errors, "" where these hardly change it."""
+    corrected_m = c.diagnostics.mpe_corrected_m
+    is_lower = corrected_m < _NOTICEABLE * c.metrics.mpe_m
+    return _if_known(1000 * corrected_m, ".1f", "mm") if is_lower else ""
+
+
 def _if_known(value: float, digits: str, unit: str) -> str:
     return f"{value:{digits}} {unit}" if math.isfinite(value) else ""
 
 
+# Ratio of a mean plane residual to that as measured below which it is listed.
+_NOTICEABLE = 0.9
 _FIGURES = ("planes", "edges", "held out", "corners")
 
 

@@ -121,8 +121,8 @@ TARGETS = (
     Target("session/rig.yaml", "results {}/session"),
     Target("session/session.json", "captures {}/session"),
     Target("session/captures/000000/meta.json", "captures {}/session"),
-    Target("registry/r1/a/result.json", "fleet table --registry {}/registry"),
-    Target("registry/r1/a/fleet.json", "fleet table --registry {}/registry"),
+    Target("registry/r1/a/result.json", "fleet table --registry {}/registry --rebuild"),
+    Target("registry/r1/a/fleet.json", "fleet table --registry {}/registry --rebuild"),
     Target("registry/fleet.parquet", "fleet table --registry {}/registry"),
 )
 

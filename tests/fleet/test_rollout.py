@@ -1,6 +1,7 @@
 """Results of many robots put onto them, one after the other, and rolled back together."""
 
 import json
+import re
 from collections.abc import Callable
 
 import pytest
@@ -19,6 +20,8 @@ from tests.saved_results import result_file
 PROFILE = dump_rig(load_rig("rles"))
 ROBOTS = tuple(f"r{k}" for k in range(1, 4))
 Add = Callable[..., None]
+HOSTILE = "\x1b]0;x\x07\x1b[2J\r\u202e\x9b31m"
+SHOWN = r"\x1b]0;x"
 
 
 @pytest.fixture
@@ -165,3 +168,50 @@ def test_a_mistake_is_an_error_before_anything_is_deployed(registry, targets, ta
         targets.write_text(text)
     with pytest.raises(error):
         roll_out(registry, target, targets, {})
+
+
+@pytest.fixture
+def said(capsys):
+    """Run a command line: everything that it printed."""
+
+    def call(*words):
+        capsys.readouterr()
+        run([str(word) for word in words])
+        printed = "".join(capsys.readouterr())
+        assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", printed), repr(printed)
+        return printed.replace("\n", "")
+
+    return call
+
+
+def test_fleet_hostile_rows_are_shown_as_text(registry, row, targets, said):
+    named = {name: f"{name}{HOSTILE}" for name in ("camera", "lidar", "status", "cause", "detail")}
+    hostile = row(robot=f"r1{HOSTILE}", date=f"2026{HOSTILE}", verdict=None, **named)
+    registry.write_table(as_table([hostile, row(robot=f"r2{HOSTILE}", verdict=f"pass{HOSTILE}")]))
+    place = ("--registry", registry.place.url)
+    assert SHOWN in said("fleet", "table", *place)
+    assert SHOWN in said("fleet", "table", *place, "--columns", "robot,cause,detail")
+    said("fleet", "table", *place, "--json")
+    said("fleet", "table", *place, "--where", f"robot = '{HOSTILE}' and")
+    said("fleet", "report", *place, "-o", targets.parent / "report.html")
+    rollout = (*place, "--target", "nav", "--targets", targets)
+    assert SHOWN in said("fleet", "deploy", *rollout, "--dry-run")
+    assert SHOWN in said("fleet", "deploy", *rollout)
+
+
+@pytest.mark.usefixtures("whole")
+def test_deploy_hostile_record_is_shown_as_text(targets, said):
+    printing = r"printf '\\033]0;x\\007\\033[2J\\r\\n'"
+    targets.write_text(re.sub('run: ".*?"', f'run: "{printing}"', targets.read_text()))
+    place = targets.parent
+    rollout = ("--registry", place / "registry", "--target", "nav", "--targets", targets)
+    said("fleet", "deploy", *rollout, "--where", "robot = 'r1'")
+    status = ("deploy", place, "--target", "nav", "--targets", targets, "--robot", "r1", "--status")
+    assert "r1" in said(*status)
+    for file in (place / "robots/r1/calib").rglob(".deployed.json"):
+        file.chmod(0o644)
+        record = json.loads(file.read_text())
+        record |= {name: f"{record[name]}{HOSTILE}" for name in ("by", "robot", "date", "reason")}
+        file.write_text(json.dumps(record))
+    assert SHOWN in said(*status)
+    said(*status[:-1], "--dry-run")

@@ -11,10 +11,10 @@ from lce_rig.rig import LidarSettings
 RINGED = [sheet for sheet in DATA_SHEETS if sheet.has_rings]
 
 
-def scan_of(elevations_deg, every=1, start=0):
+def scan_of(elevations_deg, every=1, start=0, n_columns=1024):
     """A hall of 8 x 12 m seen by a LiDAR, in firing order; every k-th point of it."""
     azimuth, elevation = np.meshgrid(
-        np.linspace(-np.pi, np.pi, 1024, endpoint=False), np.radians(elevations_deg), indexing="ij"
+        np.linspace(-np.pi, np.pi, n_columns, endpoint=False), np.radians(elevations_deg), indexing="ij"
     )
     rho = np.minimum(4 / np.abs(np.cos(azimuth)), 6 / np.maximum(np.abs(np.sin(azimuth)), 1e-9))
     ring = np.broadcast_to(np.argsort(np.argsort(elevations_deg)), azimuth.shape)
@@ -72,6 +72,25 @@ def test_compare_beams_skipped_points_are_named(every, model):
     assert finding.code == "recording.rings_skipped" and finding.figures["n_seen"] <= 8
     assert finding.figures["n_rings"] == len(beams_deg)
     assert "point_filter_num" in finding.sentence
+
+
+@pytest.mark.parametrize(("every", "model"), [(3, "VLP-16"), (5, "VLP-32C"), (3, "OS1-64")])
+def test_compare_beams_thin_rings_are_named(every, model):
+    """Every ring keeps points in each direction, as they are skipped in all of them by turns."""
+    sheet = find_data_sheet(model)
+    n_columns = round(2 * np.pi / sheet.step_rad(10.0))
+    whole = scan_of(sheet.elevations_deg, n_columns=n_columns)
+    assert compare_beams(whole, settings_of(model)) == []
+    thin = scan_of(sheet.elevations_deg, every=every, n_columns=n_columns)
+    (finding,) = compare_beams(thin, settings_of(model))
+    assert finding.code == "recording.points_skipped" and finding.figures["n"] == every
+    key = "columns" if model == "OS1-64" else "rate_hz"
+    assert "point_filter_num: 1" in finding.sentence and f"lidars.lidar.{key}" in finding.sentence
+
+
+def test_compare_beams_faster_rotor_skips_no_points():
+    beams_deg = find_data_sheet("VLP-16").elevations_deg
+    assert compare_beams(scan_of(beams_deg, n_columns=900), settings_of("VLP-16")) == []
 
 
 def test_suggest_models_of_unknown_beams_are_none():

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.core.calibration import Certificate
+from lce_rig.core.calibration import Certificate, ChannelResult
 from lce_rig.core.findings import KINDS, Finding, Refusal
-from lce_rig.core.geometry import difference, invert, perturb
+from lce_rig.core.geometry import PoseDifference, difference, invert, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
     INTRINSICS,
@@ -24,6 +24,8 @@ from lce_rig.judge.findings import (
     RANGE_OFFSET,
     ROTATION_UNCERTAIN,
     SCALE_OFF,
+    SCATTERED,
+    TIME_OFFSET,
     arrange,
     causes_of,
 )
@@ -270,6 +272,24 @@ def test_arrange_sigmas_follow_a_contradiction_only(action, follows):
     sigma = ROTATION_UNCERTAIN(severity="warning", action=action, **figures)
     listed = arrange([sigma, squares_off("warning")])
     assert [f.follows for f in listed if f.code == sigma.code] == [follows]
+
+
+def test_channels_rotated_by_180_deg_are_the_cause(estimate, verdict_of):
+    channels = tuple(ChannelResult(name, 20, 0.2, -0.3, 0.05) for name in ("frames", "frames"))
+    turned = PoseDifference(np.array([0.1, 0, 0, 0, 0, np.pi]), 1e-6 * np.eye(6))
+    verdict, listed = verdict_of(replace(estimate, channels=channels, channel_difference=turned))
+    assert verdict == "fail" and [f.code for f in causes_of(listed)][:1] == ["verdict.channels_turned"]
+    follows = {f.code: f.follows for f in listed}
+    assert follows["verdict.channels_differ"] == follows["verdict.time_offset"] == "verdict.channels_turned"
+
+
+def test_arrange_scatter_follows_late_timestamps():
+    figures = {"channel": "events", "offset_s": -0.3, "sigma_s": 0.01, "enter_s": -0.3}
+    late = TIME_OFFSET("davis", severity="warning", **figures)
+    listed = arrange([SCATTERED(ratio=4.0), late])
+    assert [(f.code, f.follows) for f in listed] == [(late.code, ""), ("verdict.scatter", late.code)]
+    slightly = replace(late, severity="note")
+    assert [f.code for f in arrange([SCATTERED(ratio=4.0), slightly])] == ["verdict.scatter", late.code]
 
 
 @pytest.mark.parametrize(("severity", "plate"), [("error", "warning"), ("note", "note")])

@@ -47,3 +47,10 @@ def test_unlike_models_boards_hide_nothing(rig, tmp_path):
         (finding,) = unlike_models(session, Detections({}, {"lidar": {name: []}}))
         assert finding.code == "recording.rings_skipped" and finding.figures["n_seen"] <= 8
         assert unlike_models(session, detect_boards(session)) == []
+
+
+def test_unlike_models_thin_rings_are_named(rig, tmp_path):
+    with Session.create(tmp_path / "s", rig) as session:
+        session.add_capture([], [room(rig, every=3)], {})
+        (finding,) = unlike_models(session, detect_boards(session))
+        assert finding.code == "recording.points_skipped" and finding.figures["n"] == 3

@@ -68,6 +68,8 @@ class Columns:
         return np.array([k for part in slices for k in range(part.start, part.stop)], dtype=np.intp)
 
 
+FIELDS = Columns(_FIELDS)
+"""Places in `State.fields`."""
 _OF_LASER = dict.fromkeys(LASER, 1)
 RING = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "residual": 1})
 """Row of a return."""

@@ -62,7 +62,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.likelihood.layout import END, RING, Indices, State
+from lce_rig.calibrate.likelihood.layout import END, FIELDS, RING, Indices, State
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
@@ -215,6 +215,28 @@ def displacements(points: Array, T_lidar_board: Array, board: Board) -> Array:
     # have noise, which it would explain.
     none = np.zeros((len(points), 3, 1))
     return np.concatenate([lens_fields(points), by_bow, none, by_print[..., None]], axis=2)
+
+
+def correct_points(lidar: LidarBoard, board: Board, rings: NDArray[np.int16], state: State) -> Array:
+    """Return a board's points (N, 3), frame lidar, without the LiDAR's estimated constant errors.
+
+    Args:
+        lidar: the board as measured.
+        board: its size.
+        rings: (L,) ring numbers of the state's lasers, ascending; other rings count as exact.
+        state: the estimate.
+    """
+    points = np.asarray(lidar.points, dtype=np.float64)
+    range_m = np.linalg.norm(points, axis=1)
+    rays = points / range_m[:, None]
+    at = np.minimum(np.searchsorted(rings, lidar.ring), len(rings) - 1)
+    lasers = state.lasers[:, at] * (rings[at] == lidar.ring)
+    of_lidar = state.fields.copy()
+    of_lidar[FIELDS["bow"]] = 0
+    fields = displacements(points, np.broadcast_to(lidar.T_lidar_board, (len(points), 4, 4)), board)
+    along_m = (range_m - lasers[0]) / (1 + of_lidar[FIELDS["stretch"]])
+    by_angles = np.einsum("nij,jn->ni", turn_rays(rays), lasers[1:])
+    return np.asarray(along_m[:, None] * rays + range_m[:, None] * by_angles + fields @ of_lidar)
 
 
 def bow_heights(on_board: Array, board: Board) -> Array:

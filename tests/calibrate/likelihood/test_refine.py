@@ -49,6 +49,9 @@ def test_noise_and_constant_errors_come_out_as_simulated(sessions):
         assert abs(figures.noise_range_m - 0.010) < 3e-4
         assert figures.noise_tilt_deg < 0.1
         assert 0.004 < figures.laser_spread_m < 0.014
+        # Mean size of the ranges' noise alone, less by the obliqueness of the boards.
+        assert 0.7 < figures.mpe_corrected_m / (0.010 * np.sqrt(2 / np.pi)) < 1
+        assert figures.mpe_corrected_m < 0.95 * estimate.metrics.mpe_m
         assert abs(figures.camera_scale - 1) < 0.001
         assert estimate.certificate.is_optimal
         assert estimate.method == "ml"
