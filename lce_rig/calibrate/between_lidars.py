@@ -137,7 +137,7 @@ def match_lidars(
             refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spin_rad)))
             continue
         lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turn)
-        observations.append(replace(o, lidar=lidar))
+        observations.append(replace(o, surface=lidar))
     if len(observations) < len(agreed) / 2:
         raise NotEnoughDataError.of(
             FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))

@@ -103,8 +103,8 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
             is_alternative = pairs.pose[chosen[k]] == 1
             T_cam_board = camera_poses(item.image)[pairs.pose[chosen[k]]]
             image = replace(item.image, T_cam_board=T_cam_board) if is_alternative else item.image
-            lidar = item.places[pairs.candidate[chosen[k]]]
-            observations.append(replace(item, image=image, lidar=lidar, others=()))
+            surface = item.places[pairs.candidate[chosen[k]]]
+            observations.append(replace(item, image=image, surface=surface, others=()))
         else:
             rows = np.flatnonzero(pairs.capture == k)
             nearest = rows[np.argmin(r2[rows])]
@@ -139,16 +139,16 @@ def _list_pairs(candidates: Sequence[Observation]) -> _Pairs:
         for c in range(len(item.places))
     ]
     T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index])
-    lidars = [candidates[k].places[c] for k, _, c in index]
+    surfaces = [candidates[k].places[c] for k, _, c in index]
     columns = np.array(index, dtype=np.intp)
     return _Pairs(
         capture=columns[:, 0],
         pose=columns[:, 1],
         candidate=columns[:, 2],
         normal_cam=T_cam[:, :3, 2],
-        normal_lidar=np.array([board.plane[:3] for board in lidars]),
+        normal_lidar=np.array([board.plane[:3] for board in surfaces]),
         centre_cam=T_cam[:, :3, 3],
-        centre_lidar=np.array([board.T_lidar_board[:3, 3] for board in lidars]),
+        centre_lidar=np.array([board.T_lidar_board[:3, 3] for board in surfaces]),
     )
 
 

@@ -79,7 +79,7 @@ class CalibrationEstimate:
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
-        lens_of_base: the same of a camera in the LiDAR's place.
+        lens_of_base: the same of the second of two cameras.
         cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -118,6 +118,13 @@ class CalibrationEstimate:
     def metrics(self) -> Metrics:
         """Errors over all captures used, of the boards as measured."""
         return summarise(self.residuals)
+
+    @property
+    def as_start(self) -> Start:
+        """The solution from which another estimate of the same captures begins."""
+        held_out_m = np.array([residual.held_out_m for residual in self.residuals])
+        seen = list(self.observations.values())
+        return Start(self.T_cam_lidar, self.certificate, seen, self.refused, held_out_m, self.diagnostics)
 
     def captures_of(self, names: Iterable[str]) -> set[str]:
         """Name every capture that holds the scan of one of the captures named."""
@@ -205,7 +212,7 @@ def capture_residual(
     """
     observation = with_squares(observation, squares)
     features = extract_features(observation, board, half_step=False)
-    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
+    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.surface.points))
     edge = board.outline_distance(ends_on_board(features, T_cam_lidar))
     return CaptureResidual(
         capture=observation.capture,

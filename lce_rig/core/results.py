@@ -142,11 +142,30 @@ class ImageBoard:
 
 
 @dataclass(frozen=True, eq=False)
-class LidarBoard:
-    """The board detected in one scan, frame lidar.
+class BoardSurface:
+    """Points on the board in the frame of the second of two sensors.
 
     Attributes:
         points: (N, 3) on the board as measured, m.
+        plane: (4,) as (n, d), n.p + d = 0, unit n towards the sensor (d > 0).
+        T_lidar_board: (4, 4) of the board in the sensor's frame; from a scan it is known up to the symmetries
+            of a rectangle.
+    """
+
+    points: Array
+    plane: Array
+    T_lidar_board: Array
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        return {"n_points": len(self.points), "distance_m": float(np.linalg.norm(self.T_lidar_board[:3, 3]))}
+
+
+@dataclass(frozen=True, eq=False)
+class LidarBoard(BoardSurface):
+    """The board detected in one scan, frame lidar; T_lidar_board is from the template.
+
+    Attributes:
         ring: (N,) int16 of each point.
         edge_points: (M, 3) first and last point of each ring on the board, as measured, m.
         edge_ring: (M,) int16.
@@ -161,15 +180,12 @@ class LidarBoard:
         edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
             standard deviation; None where the whole border is sharp.
         azimuth_step_rad: angle between neighbouring firings of one ring.
-        plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
-        T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
         offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
         quality: figures of the plate in the scan.
         stamp_ns: of the scan; None if the recording carries no time.
     """
 
-    points: Array
     ring: NDArray[np.int16]
     edge_points: Array
     edge_ring: NDArray[np.int16]
@@ -177,9 +193,7 @@ class LidarBoard:
     edge_behind_m: Array
     edge_echo: Array
     azimuth_step_rad: float
-    plane: Array
     sigma_m: float
-    T_lidar_board: Array
     quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
@@ -209,9 +223,9 @@ class LidarBoard:
         return asdict(self.quality)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PatternBoard(LidarBoard):
-    """The board in an image of another camera: its corners are the points, and it has no ring ends.
+@dataclass(frozen=True, eq=False)
+class PatternBoard(BoardSurface):
+    """The board in an image of the second of two cameras: the points are its corners.
 
     Attributes:
         image: the detection.
@@ -221,50 +235,19 @@ class PatternBoard(LidarBoard):
 
     @classmethod
     def of(cls, image: ImageBoard, corners: Array) -> "PatternBoard":
-        """Put the corners of a board (N, 3), frame board, where an image has it, frame of its camera.
+        """Put the corners of a board (N, 3), frame board, where an image has it.
 
         Args:
             image: the detection.
             corners: `Board.corners()`.
         """
         T, is_seen = image.T_cam_board, np.isfinite(image.corners_px[:, 0])
-        points = corners[is_seen] @ T[:3, :3].T + T[:3, 3]
-        n, none, unknown = len(points), np.zeros(0), math.nan
-        quality = LidarQuality(
-            width_m=unknown,
-            height_m=unknown,
-            width_sigma_m=math.inf,
-            height_sigma_m=math.inf,
-            n_rings=0,
-            n_points=n,
-            n_ring_ends=0,
-            n_ring_ends_dropped=0,
-            plane_rms_m=unknown,
-            edge_rms_m=unknown,
-            template_m=unknown,
-            beyond_share=0.0,
-            distance_m=image.distance_m,
-        )
         normal = -T[:3, 2] * np.sign(T[:3, 2] @ T[:3, 3])
-        return cls(
-            points=points,
-            ring=np.full(n, NO_RING, dtype=np.int16),
-            edge_points=np.zeros((0, 3)),
-            edge_ring=np.zeros(0, dtype=np.int16),
-            edge_side=np.zeros(0, dtype=np.int8),
-            edge_behind_m=none,
-            edge_echo=none,
-            azimuth_step_rad=1.0,
-            plane=np.append(normal, -normal @ T[:3, 3]),
-            sigma_m=1.0,
-            T_lidar_board=T,
-            quality=quality,
-            stamp_ns=image.stamp_ns,
-            image=image,
-        )
+        points = corners[is_seen] @ T[:3, :3].T + T[:3, 3]
+        return cls(points, np.append(normal, -normal @ T[:3, 3]), T, image)
 
     @classmethod
-    def candidates(cls, image: ImageBoard, corners: Array) -> list[LidarBoard]:
+    def candidates(cls, image: ImageBoard, corners: Array) -> list["PatternBoard"]:
         """List the poses that an image leaves open; arguments as of `of`."""
         poses = [image.T_cam_board]
         if image.T_cam_board_alternative is not None:
@@ -274,19 +257,37 @@ class PatternBoard(LidarBoard):
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One board placement seen by one camera channel and one LiDAR."""
+    """One board placement seen by two sensors: a camera channel and a LiDAR, or two sensors of one kind.
+
+    Attributes:
+        capture: its name.
+        image: the board seen by the first sensor.
+        surface: by the second.
+        others: further places where the second sensor may see it.
+    """
 
     capture: str
     image: ImageBoard
-    lidar: LidarBoard
-    others: tuple[LidarBoard, ...] = ()
+    surface: BoardSurface
+    others: tuple[BoardSurface, ...] = ()
 
     @classmethod
-    def of(cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard]) -> "Observation":
-        """Pair a board in an image with its possible places in the scan, best first."""
+    def of(cls, capture: str, image: ImageBoard, places: Sequence[BoardSurface]) -> "Observation":
+        """Pair the first sensor's board with its possible places for the second one, best first."""
         return cls(capture, image, places[0], tuple(places[1:]))
 
     @property
-    def places(self) -> tuple[LidarBoard, ...]:
-        """All places in the scan where the board may be, best first."""
-        return (self.lidar, *self.others)
+    def lidar(self) -> LidarBoard:
+        """The board in the second sensor's scan.
+
+        Raises:
+            TypeError: that sensor is a camera.
+        """
+        if not isinstance(self.surface, LidarBoard):
+            raise TypeError(f"{self.capture}: the second sensor is not a LiDAR")
+        return self.surface
+
+    @property
+    def places(self) -> tuple[BoardSurface, ...]:
+        """All places where the second sensor may see the board, best first."""
+        return (self.surface, *self.others)

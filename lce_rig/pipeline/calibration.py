@@ -52,7 +52,7 @@ from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect_boards
+from lce_rig.pipeline.detect_session import boards_in, detect_boards
 from lce_rig.pipeline.findings import FEW_DETECTED, LIDAR_ABSENT, SHORTAGE, UNCONNECTED, few_detected
 from lce_rig.pipeline.peer_pairs import (
     SolvedPeers,
@@ -319,20 +319,20 @@ def _shared_lenses(
 ) -> dict[str, SessionLens]:
     """Fit the lens of each camera with several LiDARs once: extrinsics with other lenses differ by a turn."""
     n_lidars = Counter(pairs[0].camera for pairs in groups)
-    seen: dict[str, dict[str, dict[str, Observation]]] = {}
+    seen: dict[str, dict[str, dict[str, ImageBoard]]] = {}
     for pair in (pair for pairs in groups for pair in pairs if n_lidars[pair.camera] > 1):
-        found, _ = candidates_of(detections, pair)
+        found, _ = detections.candidates(pair, rig.board.to_board())
         if len(found) >= rig.quality.min_captures:
             of_channel = seen.setdefault(pair.camera, {}).setdefault(pair.channel, {})
-            of_channel.update({each.capture: each for each in found})
+            of_channel.update({each.capture: each.image for each in found})
     lenses = {}
     for camera, by_channel in seen.items():
         prior = Tolerances.of(rig.cameras[camera], rig.board).lens
-        observations = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
+        images = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
         # A pair that is estimated reports why its lens cannot be fitted.
         with suppress(NotEnoughDataError):
             if not prior.is_exact:
-                lenses[camera] = fit_session_lens(observations, rig.board.to_board(), prior)
+                lenses[camera] = fit_session_lens(images, rig.board.to_board(), prior)
     return lenses
 
 
@@ -354,7 +354,7 @@ def _solve(
     refused: dict[str, Refusal] = {}
     shortages: list[Finding] = []
     for pair in pairs:
-        of_channel, own_refused = candidates_of(detections, pair)
+        of_channel, own_refused = detections.candidates(pair, rig.board.to_board())
         refused = {**own_refused, **refused}
         if len(of_channel) >= n_needed:
             candidates[pair.channel] = of_channel

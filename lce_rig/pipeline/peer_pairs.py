@@ -28,7 +28,6 @@ from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model
 from lce_rig.judge.session_check import match_candidates
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge
-from lce_rig.pipeline.detect_session import candidates_of
 from lce_rig.pipeline.findings import SHORTAGE, few_detected
 from lce_rig.rig import Rig
 
@@ -184,7 +183,7 @@ def _solve(
 ) -> SolvedPeers:
     """Estimate the pose of two sensors; raises NotEnoughDataError."""
     names, board = (pair.camera, pair.lidar), rig.board.to_board()
-    candidates, lacking = candidates_of(detections.between(pair, board), pair)
+    candidates, lacking = detections.candidates(pair, board)
     if len(candidates) < rig.quality.min_captures:
         raise NotEnoughDataError.of(
             few_detected(str(pair), len(candidates), lacking, rig.quality.min_captures)
@@ -197,7 +196,9 @@ def _solve(
             )
             for name in names
         )
-        seen = {o.capture: (o.image, o.lidar.image) for o in candidates if isinstance(o.lidar, PatternBoard)}
+        seen = {
+            o.capture: (o.image, o.surface.image) for o in candidates if isinstance(o.surface, PatternBoard)
+        }
         given = match_cameras(seen, board, (first, second))
     else:
         first, second = (EstimateSettings.of(options, rig.lidars[name]) for name in names)

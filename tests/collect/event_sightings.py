@@ -70,4 +70,4 @@ def plate():
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)
     plane = np.array([0, 0, 1.0, -3.0])
     quality = measured_plate(0.8, 0.6, none)
-    return LidarBoard(none, ring, none, ring, side, nothing, nothing, 0.003, plane, 0.01, np.eye(4), quality)
+    return LidarBoard(none, plane, np.eye(4), ring, none, ring, side, nothing, nothing, 0.003, 0.01, quality)

@@ -39,7 +39,7 @@ def with_points(observation, change):
     lidar = observation.lidar
     points, ends = change(lidar.points, lidar.ring), change(lidar.edge_points, lidar.edge_ring)
     return replace(
-        observation, lidar=replace(lidar, points=points, edge_points=ends, plane=fit_plane(points)[0])
+        observation, surface=replace(lidar, points=points, edge_points=ends, plane=fit_plane(points)[0])
     )
 
 

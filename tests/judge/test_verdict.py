@@ -181,7 +181,7 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of
 def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected, verdict_of):
     def resized(seen):
         quality = replace(seen.lidar.quality, width_m=factor * BOARD.width_m, width_sigma_m=0.01)
-        return replace(seen, lidar=replace(seen.lidar, quality=quality))
+        return replace(seen, surface=replace(seen.lidar, quality=quality))
 
     other = {name: resized(seen) for name, seen in estimate.observations.items()}
     verdict, reasons = verdict_of(replace(estimate, observations=other))

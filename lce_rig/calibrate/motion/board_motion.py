@@ -274,7 +274,7 @@ def deskew_points(
     """Motion-compensate the points of boards to one time, as `compensate`."""
     R_cam_lidar = T_cam_lidar[:3, :3]
     rates = np.concatenate([motions.rates[:, :3] @ R_cam_lidar, motions.rates[:, 3:] @ R_cam_lidar], axis=1)
-    return [replace(o, lidar=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
+    return [replace(o, surface=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
 
 
 def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:

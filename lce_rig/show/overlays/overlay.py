@@ -18,7 +18,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.phrasing import sizes
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import BoardSurface, ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.session_check import SessionCheck
@@ -47,7 +47,7 @@ def draw_overlay(
     intrinsics: Intrinsics,
     T_cam_lidar: Array,
     *,
-    lidar_board: LidarBoard | None,
+    lidar_board: BoardSurface | None,
     image_board: ImageBoard | None,
     board: Board,
     limits_m: tuple[float, float] | None = None,
@@ -62,7 +62,7 @@ def draw_overlay(
         scan: points in frame lidar.
         intrinsics: the camera.
         T_cam_lidar: (4, 4) the extrinsics to judge.
-        lidar_board: its points and ring ends are marked; None for the scan only.
+        lidar_board: its points are marked, and ring ends of a LiDAR; None for the scan only.
         image_board: its outline and corners are drawn; None for none.
         board: the board, for its outline.
         limits_m: ends of the range scale; those of the scan if None.
@@ -78,6 +78,7 @@ def draw_overlay(
     if lidar_board is not None:
         on_board = _to_picture(lidar_board.points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_discs(picture, on_board, MAGENTA, 1.9 * unit, WHITE)
+    if isinstance(lidar_board, LidarBoard):
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
     return picture
@@ -288,7 +289,7 @@ def _draw(
     if meeting is not None:
         # The board's points are drawn separately, moved to the image's time.
         points, on_board = (
-            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.lidar.points)
+            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.surface.points)
         )
         row = np.dtype((np.void, points.dtype.itemsize * 3))
         scan = scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
