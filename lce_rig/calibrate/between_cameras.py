@@ -93,8 +93,8 @@ def _refit(
 
 def _mean(observations: Sequence[Observation], board: Board) -> Start:
     """Average the relative poses of all captures, and predict each placement from the others."""
-    T = np.array([o.image.T_cam_board @ invert(o.surface.T_lidar_board) for o in observations])
-    placement = group_poses(np.array([o.image.T_cam_board for o in observations]))
+    T = np.array([o.pose.T_cam_board @ invert(o.surface.T_lidar_board) for o in observations])
+    placement = group_poses(np.array([o.pose.T_cam_board for o in observations]))
     # A rotation shifts boards that are far away more; their poses are as uncertain as near ones' here.
     information = np.tile(np.diag(_TYPICAL**-2), (len(T), 1, 1))
 
@@ -111,7 +111,7 @@ def _mean(observations: Sequence[Observation], board: Board) -> Start:
         for k in np.flatnonzero(is_here).tolist():
             o = observations[k]
             there = transform(T_others @ o.surface.T_lidar_board, corners)
-            apart = there - transform(o.image.T_cam_board, corners)
+            apart = there - transform(o.pose.T_cam_board, corners)
             held_out_m[k] = np.sqrt(np.mean(np.sum(apart**2, axis=1)))
     # The mean pose is unique: its start needs no search.
     return Start(T_all, Certificate(True, 0.0), list(observations), {}, held_out_m, Diagnostics())

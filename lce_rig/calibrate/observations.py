@@ -129,8 +129,8 @@ def board_key(surface: BoardSurface) -> bytes:
 
 
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
-    """Number the board placements (F,) of captures by the camera's poses of the board."""
-    poses = np.array([observation.image.T_cam_board for observation in observations])
+    """Number the board placements (F,) of captures by the first sensor's poses of the board."""
+    poses = np.array([observation.pose.T_cam_board for observation in observations])
     return group_poses(poses.reshape(-1, 4, 4))
 
 

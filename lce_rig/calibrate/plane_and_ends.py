@@ -115,8 +115,8 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
         plane_points=_meet_plane(np.asarray(surface.points, dtype=np.float64), surface.plane),
         edge_points=_meet_plane(ends, surface.plane),
         lidar_normal=surface.plane[:3],
-        T_cam_board=observation.image.T_cam_board,
-        cov=observation.image.cov,
+        T_cam_board=observation.pose.T_cam_board,
+        cov=observation.pose.cov,
     )
 
 

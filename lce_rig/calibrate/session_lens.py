@@ -89,7 +89,7 @@ class SessionLens:
     def refit(self, observations: Sequence[Observation]) -> list[Observation]:
         """Fit the poses in the images of observations anew with this lens and board."""
         images = self.refit_images([each.image for each in observations])
-        return [replace(each, image=image) for each, image in zip(observations, images, strict=True)]
+        return [replace(each, pose=image) for each, image in zip(observations, images, strict=True)]
 
     def refit_images(self, boards: Sequence[ImageBoard]) -> list[ImageBoard]:
         """Fit the poses of boards anew with this lens and board."""

@@ -15,8 +15,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.results import BoardSurface, ImageBoard
-from lce_rig.detect.detection import Detections, ImageDetection, Pair, SurfaceDetection
+from lce_rig.core.results import BoardPose, BoardSurface
+from lce_rig.detect.detection import Detections, Pair, PoseDetection, SurfaceDetection
 from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.pipeline.detect_session import association_errors, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
@@ -98,7 +98,7 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     if any(is_of_all(each) for each in association):
         return association
     both = detections.candidates(pair, board)[0]
-    in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
+    in_camera = np.array([each.pose.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
     in_lidar = np.array([each.surface.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
     of_distances = []
     if pair.channel:
@@ -107,10 +107,10 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     return [*association, *of_distances, *plate_findings(scans, board)]
 
 
-def _record(image: ImageDetection, surfaces: SurfaceDetection, refusal: Refusal | None) -> dict[str, Any]:
+def _record(pose: PoseDetection, surfaces: SurfaceDetection, refusal: Refusal | None) -> dict[str, Any]:
     """Describe a capture for programs; figures that were not measured are null."""
 
-    def figures(detected: ImageBoard | BoardSurface | Refusal) -> dict[str, float | None] | None:
+    def figures(detected: BoardPose | BoardSurface | Refusal) -> dict[str, float | None] | None:
         if isinstance(detected, Refusal):
             return None
         values = detected.figures().items()
@@ -119,7 +119,7 @@ def _record(image: ImageDetection, surfaces: SurfaceDetection, refusal: Refusal 
     return {
         "is_usable": refusal is None,
         "refusal": None if refusal is None else refusal.as_json(),
-        "image": figures(image),
+        "image": figures(pose),
         "lidar": figures(surfaces if isinstance(surfaces, Refusal) else surfaces[0]),
         "n_surfaces": 0 if isinstance(surfaces, Refusal) else len(surfaces),
     }

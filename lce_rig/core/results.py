@@ -86,16 +86,44 @@ class LidarQuality:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageBoard:
-    """The board detected in one image.
+class BoardPose:
+    """The board's pose in the frame of the first of two sensors: of a camera, or of a LiDAR.
+
+    Attributes:
+        T_cam_board: (4, 4), the likeliest pose.
+        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
+        T_cam_board_alternative: (4, 4) second pose that fits; None if there is none.
+        chi2_gap: excess of the alternative's cost, in units of the noise's variance.
+    """
+
+    T_cam_board: Array
+    cov: Array
+    T_cam_board_alternative: Array | None
+    chi2_gap: float
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the board's origin from the sensor."""
+        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the board's normal and the line of sight."""
+        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
+        return float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        return {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBoard(BoardPose):
+    """The board detected in one image; T_cam_board has the smaller reprojection error.
 
     Attributes:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, of boards whose
             markers name the corners.
-        T_cam_board: (4, 4), the pose with the smaller reprojection error.
-        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
-        T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
-        chi2_gap: excess of the alternative's cost, in units of the corner variance.
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -108,10 +136,6 @@ class ImageBoard:
     """
 
     corners_px: Array
-    T_cam_board: Array
-    cov: Array
-    T_cam_board_alternative: Array | None
-    chi2_gap: float
     reprojection_px: float
     sigma_px: float
     quality: ImageQuality | None = None
@@ -121,22 +145,11 @@ class ImageBoard:
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
 
-    @property
-    def distance_m(self) -> float:
-        """Distance of the pattern's middle from the camera."""
-        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle between the board's normal and the line of sight."""
-        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
-        return float(np.degrees(np.arccos(min(cosine, 1.0))))
-
     def figures(self) -> dict[str, float]:
         """List every figure by name, for tables and programs."""
         figures = {} if self.quality is None else asdict(self.quality)
         figures["corner_rms_px"] = self.reprojection_px
-        figures |= {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+        figures |= super().figures()
         measured = {} if self.events is None else asdict(self.events)
         return figures | {name: value for name, value in measured.items() if not math.isnan(value)}
 
@@ -261,20 +274,31 @@ class Observation:
 
     Attributes:
         capture: its name.
-        image: the board seen by the first sensor.
+        pose: of the board by the first sensor.
         surface: by the second.
         others: further places where the second sensor may see it.
     """
 
     capture: str
-    image: ImageBoard
+    pose: BoardPose
     surface: BoardSurface
     others: tuple[BoardSurface, ...] = ()
 
     @classmethod
-    def of(cls, capture: str, image: ImageBoard, places: Sequence[BoardSurface]) -> "Observation":
-        """Pair the first sensor's board with its possible places for the second one, best first."""
-        return cls(capture, image, places[0], tuple(places[1:]))
+    def of(cls, capture: str, pose: BoardPose, places: Sequence[BoardSurface]) -> "Observation":
+        """Pair the first sensor's pose with the possible places for the second sensor, best first."""
+        return cls(capture, pose, places[0], tuple(places[1:]))
+
+    @property
+    def image(self) -> ImageBoard:
+        """The board in the first sensor's image.
+
+        Raises:
+            TypeError: that sensor is a LiDAR.
+        """
+        if not isinstance(self.pose, ImageBoard):
+            raise TypeError(f"{self.capture}: the first sensor is not a camera")
+        return self.pose
 
     @property
     def lidar(self) -> LidarBoard:

@@ -15,6 +15,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import (
+    BoardPose,
     BoardSurface,
     EventQuality,
     ImageBoard,
@@ -29,6 +30,7 @@ Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
 ImageDetection = ImageBoard | Refusal
 Detection = ImageDetection | LidarDetection
+PoseDetection = BoardPose | Refusal
 SurfaceDetection = Sequence[BoardSurface] | Refusal
 
 _RECORDS: dict[type, dict[str, type]] = {
@@ -171,7 +173,7 @@ class Detections:
         of_cameras = [p for p in self.camera_pairs() if not {p.camera, p.lidar} <= related]
         return [*self.lidar_pairs(lidars), *of_cameras]
 
-    def between(self, pair: Pair, board: Board) -> dict[str, tuple[ImageDetection, SurfaceDetection]]:
+    def between(self, pair: Pair, board: Board) -> dict[str, tuple[PoseDetection, SurfaceDetection]]:
         """List what both sensors of a pair saw in each of their captures, sorted.
 
         Args:
@@ -189,13 +191,13 @@ class Detections:
     def candidates(self, pair: Pair, board: Board) -> tuple[list[Observation], dict[str, Refusal]]:
         """List the captures in which both sensors detect the board; and by capture why the others do not."""
         candidates, refused = [], {}
-        for name, (image, surfaces) in self.between(pair, board).items():
-            if isinstance(image, Refusal):
-                refused[name] = image
+        for name, (pose, surfaces) in self.between(pair, board).items():
+            if isinstance(pose, Refusal):
+                refused[name] = pose
             elif isinstance(surfaces, Refusal):
                 refused[name] = surfaces
             else:
-                candidates.append(Observation.of(name, image, surfaces))
+                candidates.append(Observation.of(name, pose, surfaces))
         return candidates, refused
 
     def captures(self, pair: Pair) -> list[str]:
@@ -217,23 +219,13 @@ class Detections:
 
 
 def _as_surfaces(found: Detection, board: Board) -> SurfaceDetection:
-    """Convert the two poses that fit an image to candidates of a scan."""
+    """Put the corners where the poses that fit an image have them; return boards in a scan as they are."""
     return PatternBoard.candidates(found, board.corners()) if isinstance(found, ImageBoard) else found
 
 
-def _as_pose(found: Detection) -> ImageDetection:
-    """Convert the poses of the two likeliest boards in a scan to the two poses that fit an image."""
+def _as_pose(found: Detection) -> PoseDetection:
+    """Return the poses of the two likeliest boards in a scan; those in an image as they are."""
     if not isinstance(found, list):
         return found
     T, other = found[0].T_lidar_board, found[1].T_lidar_board if len(found) > 1 else None
-    nothing, unknown = np.zeros((0, 2)), float("nan")
-    return ImageBoard(
-        nothing,
-        T,
-        np.zeros((6, 6)),
-        other,
-        float("inf") if other is None else 0.0,
-        unknown,
-        unknown,
-        stamp_ns=found[0].stamp_ns,
-    )
+    return BoardPose(T, np.zeros((6, 6)), other, float("inf") if other is None else 0.0)

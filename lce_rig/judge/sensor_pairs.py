@@ -184,8 +184,8 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
 
 
 def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:
-    middles = [(T_second_first @ one.image.T_cam_board[:, 3])[:3] for one, _ in shared]
-    seen = [other.image.T_cam_board[:3, 3] for _, other in shared]
+    middles = [(T_second_first @ one.pose.T_cam_board[:, 3])[:3] for one, _ in shared]
+    seen = [other.pose.T_cam_board[:3, 3] for _, other in shared]
     return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
 
 

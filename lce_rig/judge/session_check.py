@@ -98,7 +98,7 @@ def bring_together(
 
 def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
     """Move the LiDAR's board from the time of the scan to that of the image."""
-    moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.image.T_cam_board) @ T_cam_lidar
+    moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.pose.T_cam_board) @ T_cam_lidar
     lidar = swept.lidar
     return replace(
         lidar,
@@ -119,9 +119,9 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
         board: its size weighs angles against distances.
         T_cam_lidar: (4, 4).
     """
-    poses = [candidates.image.T_cam_board]
-    if candidates.image.T_cam_board_alternative is not None:
-        poses.append(candidates.image.T_cam_board_alternative)
+    poses = [candidates.pose.T_cam_board]
+    if candidates.pose.T_cam_board_alternative is not None:
+        poses.append(candidates.pose.T_cam_board_alternative)
     arm_m = np.hypot(board.width_m, board.height_m) / 2
 
     def misfit(pair: tuple[int, int]) -> float:
@@ -134,8 +134,8 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
     pose_index, lidar_index = min(
         itertools.product(range(len(poses)), range(len(candidates.places))), key=misfit
     )
-    image = replace(candidates.image, T_cam_board=poses[pose_index])
-    return replace(candidates, image=image, surface=candidates.places[lidar_index], others=())
+    pose = replace(candidates.pose, T_cam_board=poses[pose_index])
+    return replace(candidates, pose=pose, surface=candidates.places[lidar_index], others=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,6 +312,6 @@ def find_meetings(
         for candidates in detections.candidates(of_channel, board)[0]:
             matched = match_candidates(candidates, board, T_cam_lidar)
             middle = T_cam_lidar @ matched.surface.T_lidar_board[:, 3]
-            if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
+            if np.linalg.norm(middle[:3] - matched.pose.T_cam_board[:3, 3]) < _ELSEWHERE_M:
                 observations[name].append(matched)
     return bring_together(observations, pair.channel, T_cam_lidar, results, clocks)

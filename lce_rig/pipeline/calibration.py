@@ -533,7 +533,7 @@ def _judged(
     square_m = rig.board.square_m * squares_scale(estimate.diagnostics)
     cov_lens = np.zeros((0, 0)) if estimate.lens is None else estimate.lens.estimate.cov
     cross = estimate.cov_with_lens
-    distances_m = [np.linalg.norm(o.image.T_cam_board[:3, 3]) for o in estimate.observations.values()]
+    distances_m = [np.linalg.norm(o.pose.T_cam_board[:3, 3]) for o in estimate.observations.values()]
     return Calibration(
         camera=own.camera,
         channels=tuple(channel.channel for channel in estimate.channels),

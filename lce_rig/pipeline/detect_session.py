@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from lce_rig.calibrate.association import find_association_error
-from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
+from lce_rig.calibrate.consensus import Consensus, find_consensus, open_poses
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
@@ -407,6 +407,6 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
             image, scan = detections.of(pair, name)
             is_moved = isinstance(scan, Refusal) and scan.code == LIDAR_OTHER_ORIGIN.code
             if name not in agreeing and not isinstance(image, Refusal) and not is_moved:
-                poses = [T_lidar_cam @ T_cam_board for T_cam_board in camera_poses(image)]
+                poses = [T_lidar_cam @ T_cam_board for T_cam_board in open_poses(image)]
                 expected.setdefault(pair.lidar, {}).setdefault(name, poses)
     return expected

@@ -1,8 +1,7 @@
 """Two sensors of one kind that saw the same boards: their captures, and the judgement of their pose.
 
-In a result the first LiDAR of the profile stands in the camera's place, the second camera in the LiDAR's:
-T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired where one of
-them has no LiDAR; where both have one, its result relates them.
+In a result T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired
+where one of them has no LiDAR; where both have one, its result relates them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -141,13 +140,15 @@ def judged_peers(rig: Rig, own: SolvedPeers, others: Sequence[Finding]) -> Calib
     (first, second), estimate, validation = own.names, own.estimate, own.validation
     n_captures = own.n_detected + len(own.refused)
     verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, own.T_view)
-    distances_m = [o.image.distance_m for o in estimate.observations.values()]
+    distances_m = [o.pose.distance_m for o in estimate.observations.values()]
     T_first, lens, other = invert(own.T_view), estimate.lens, estimate.lens_of_base
-    channels = (own.pair.channel,) if own.pair.lidar_channel else ()
-    noise_px = np.sqrt(np.mean([o.image.sigma_px**2 for o in estimate.observations.values()]))
+    channels: tuple[ChannelResult, ...] = ()
+    if own.pair.lidar_channel:
+        noise_px = np.sqrt(np.mean([o.image.sigma_px**2 for o in estimate.observations.values()]))
+        channels = (ChannelResult(own.pair.channel, len(estimate.used), float(noise_px)),)
     return Calibration(
         camera=first,
-        channels=channels,
+        channels=tuple(each.channel for each in channels),
         lidar_channel=own.pair.lidar_channel,
         lidar=second,
         T_cam_lidar=own.T_first_second,
@@ -163,7 +164,7 @@ def judged_peers(rig: Rig, own: SolvedPeers, others: Sequence[Finding]) -> Calib
         verdict=verdict,
         findings=findings,
         diagnostics=estimate.diagnostics,
-        channel_results=tuple(ChannelResult(name, len(estimate.used), float(noise_px)) for name in channels),
+        channel_results=channels,
         intrinsics=None if lens is None else lens.intrinsics,
         lidar_intrinsics=None if other is None else other.intrinsics,
         method=estimate.method,
@@ -221,6 +222,5 @@ def _validate(
 
 def _seen_from(T: Array, observation: Observation) -> Observation:
     """Express the first LiDAR's pose of the board in another frame of the same origin."""
-    return replace(
-        observation, image=replace(observation.image, T_cam_board=T @ observation.image.T_cam_board)
-    )
+    pose = observation.pose
+    return replace(observation, pose=replace(pose, T_cam_board=T @ pose.T_cam_board))

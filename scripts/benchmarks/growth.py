@@ -39,7 +39,7 @@ def _measure(n_captures: int, method: Method, folder: Path) -> tuple[str, str, s
     chosen = session.candidates[:n_captures]
     detections = Detections(
         {(next(iter(rig.cameras)), "frames"): {each.capture: each.image for each in chosen}},
-        {next(iter(rig.lidars)): {each.capture: list(each.places) for each in chosen}},
+        {next(iter(rig.lidars)): {each.capture: session.places[each.capture] for each in chosen}},
     )
     start = time.process_time()
     (calibration, *_), _ = calibrate_detections(rig, detections, CalibrateOptions(method))

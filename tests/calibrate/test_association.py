@@ -27,13 +27,13 @@ def mirrored(item, side=ACROSS):
     corners = item.image.corners_px.reshape(BOARD.rows, BOARD.cols, 2)[:, ::-1].reshape(-1, 2).copy()
     corners[:, axis] = size_px - 1 - corners[:, axis]
     solved = solve_planar_pose(corners, BOARD.corners(), CAMERA)
-    return replace(item, image=board_from_pose(corners, solved))
+    return replace(item, pose=board_from_pose(corners, solved))
 
 
 def dealt(captures, sources):
     """Give every capture the image of another."""
     images = [captures[k].image for k in sources]
-    return [replace(item, image=image) for item, image in zip(captures, images, strict=True)]
+    return [replace(item, pose=image) for item, image in zip(captures, images, strict=True)]
 
 
 def error_in(captures):

@@ -78,7 +78,7 @@ def test_consensus_swapped_pose_is_corrected():
             T_cam_board_alternative=item.image.T_cam_board,
             chi2_gap=2.0,
         )
-        swapped.append(replace(item, image=image))
+        swapped.append(replace(item, pose=image))
     consensus = find_consensus(swapped + captures[4:], BOARD)
     chosen = {observation.capture: observation.image.T_cam_board for observation in consensus.observations}
     for item in captures[:4]:

@@ -101,7 +101,7 @@ def test_lens_change_moves_extrinsics(captures, method):
     poses, _, turns = lens.errors([o.image for o in estimate.observations.values()])
     poses = poses[:, :, k]
     moved = [
-        replace(o, image=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
+        replace(o, pose=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
         for o, move in zip(estimate.observations.values(), poses, strict=True)
     ]
     again = fit_extrinsic(moved, BOARD, replace(SETTINGS, method=method))

@@ -61,7 +61,7 @@ def board_at(x_m, y_m):
     """A board that faces the camera."""
     T_cam_board = np.diag([1.0, -1.0, -1.0, 1.0])
     T_cam_board[:3, 3] = x_m, y_m, 3.0
-    return ImageBoard(np.zeros((54, 2)), T_cam_board, np.eye(6) * 1e-6, None, np.inf, 0.1, 0.1)
+    return ImageBoard(T_cam_board, np.eye(6) * 1e-6, None, np.inf, np.zeros((54, 2)), 0.1, 0.1)
 
 
 def plate():

@@ -25,7 +25,7 @@ def observed(n=16, seed=1):
 
 
 def seen_at(observation, T_cam_board):
-    return replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
+    return replace(observation, pose=replace(observation.image, T_cam_board=T_cam_board))
 
 
 def moved(observations, is_moved, tangent):

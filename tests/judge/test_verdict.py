@@ -336,7 +336,7 @@ def test_wrong_square_size_is_measured():
         T = item.image.T_cam_board.copy()
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
-        captures.append(replace(item, image=image))
+        captures.append(replace(item, pose=image))
     wrong = fit_extrinsic(captures, BOARD, EstimateSettings())
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict != "pass" and reasons[0].code == "verdict.scale"

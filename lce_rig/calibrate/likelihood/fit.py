@@ -24,7 +24,7 @@ from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
-from lce_rig.core.results import LidarBoard, Observation, PatternBoard
+from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
 
 # Maximum number of steps between fits of the levels, and of the last steps.
 STEPS, _LAST_STEPS = 3, 20
@@ -198,7 +198,7 @@ def maximise_likelihood(
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
     base = None if len(images) == len(cameras) else len(cameras)
     by_name = {
-        o.capture: invert(T) @ o.image.T_cam_board
+        o.capture: invert(T) @ o.pose.T_cam_board
         for camera, T in zip(cameras, T_cam_lidar, strict=True)
         for o in camera
     }
@@ -226,7 +226,9 @@ def stack_captures(
     else:
         lidars = {o.capture: o.lidar for camera in cameras for o in camera}
         scans = stack_scans([interior(lidars[name], board) for name in order], board)
-    seen = [{o.capture: o.image for o in camera} for camera in cameras]
+    seen: list[Mapping[str, BoardPose]] = [{o.capture: o.pose for o in camera} for camera in cameras]
+    if by_base:
+        seen.append(by_base)
     images = [
         stack_images(
             np.array([order[name] for name in of_camera]),
@@ -234,7 +236,7 @@ def stack_captures(
             board.pattern_offset_m,
             lens,
         )
-        for of_camera, lens in zip([*seen, *([by_base] if by_base else [])], lenses, strict=True)
+        for of_camera, lens in zip(seen, lenses, strict=True)
     ]
     if pose_ratios is not None:
         images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]

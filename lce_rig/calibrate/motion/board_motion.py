@@ -262,7 +262,7 @@ def compensate(
     """
     times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
     moved = [
-        replace(o, image=replace(o.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
+        replace(o, pose=replace(o.pose, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
         for o, T, cov in zip(observations, motions.at(times_s), motions.cov_at(times_s), strict=True)
     ]
     return deskew_points(moved, motions, T_cam_lidar)

@@ -98,7 +98,7 @@ def test_refine_lost_laser_height_is_found():
 def test_refine_image_tilt_noise_is_found():
     rng = np.random.default_rng(0)
     tilted = [
-        replace(o, image=replace(o.image, T_cam_board=o.image.T_cam_board @ pose(exp_so3(phi), np.zeros(3))))
+        replace(o, pose=replace(o.image, T_cam_board=o.image.T_cam_board @ pose(exp_so3(phi), np.zeros(3))))
         for o, phi in zip(
             observations(30, 1, REAL), np.radians([0.4, 0.4, 0]) * rng.standard_normal((30, 3)), strict=True
         )
@@ -159,7 +159,7 @@ def test_refine_second_camera_gains_accuracy():
     for o in first:
         image = photograph(T_second @ invert(T_FORWARD) @ o.image.T_cam_board, rng, noisy, BOARD)
         if image is not None:
-            second.append(replace(o, image=image))
+            second.append(replace(o, pose=image))
     assert len(second) > 8
     priors, usual = Priors(), Levels(laser_m=0.008)
     start = perturb(T_second, np.array([0.01, -0.01, 0.01, 0.005, 0.005, -0.005]))
