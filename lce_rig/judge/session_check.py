@@ -242,6 +242,8 @@ def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration)
     for name, lens in ((c.camera, c.intrinsics), (c.lidar, c.lidar_intrinsics)):
         if lens is not None:
             lenses[name] = lens
+    if not lenses:
+        return detections
     board = rig.board.to_board()
     corners = replace(board, square_m=calibration.square_m or board.square_m).corners()
     if calibration.board_shape is not None:
