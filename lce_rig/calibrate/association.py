@@ -114,12 +114,12 @@ def _mirrored(item: Observation, mirror: Array) -> Observation:
     def reflected(T_cam_board: Array) -> Array:
         return np.asarray(mirror[:, None] * T_cam_board * _IN_PLANE)
 
-    image, second = item.image, item.image.T_cam_board_alternative
+    pose, second = item.pose, item.pose.T_cam_board_alternative
     alternative = None if second is None else reflected(second)
-    image = replace(image, T_cam_board=reflected(image.T_cam_board), T_cam_board_alternative=alternative)
-    return replace(item, image=image)
+    pose = replace(pose, T_cam_board=reflected(pose.T_cam_board), T_cam_board_alternative=alternative)
+    return replace(item, pose=pose)
 
 
 def _paired(images: Candidates, scans: Candidates) -> list[Observation]:
     """Pair images and scans of different captures one by one; the capture is that of the scan."""
-    return [replace(scan, image=image.image) for image, scan in zip(images, scans, strict=False)]
+    return [replace(scan, pose=image.pose) for image, scan in zip(images, scans, strict=False)]

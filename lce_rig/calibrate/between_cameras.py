@@ -5,7 +5,7 @@
     mean_pose           the relative pose, and without each placement in turn
     maximise_likelihood noise levels
 
-The second camera takes the LiDAR's place (`PatternBoard`).
+The first camera's images give poses of the board, the second one's points on it (`PatternBoard`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,20 +23,18 @@ from lce_rig.calibrate.result import Start
 from lce_rig.calibrate.session_lens import SessionLens, fit_session_lens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Certificate, Diagnostics
-from lce_rig.core.geometry import Array, invert, mean_pose, transform
+from lce_rig.core.geometry import Array, invert, mean_pose, student_weights, transform
 from lce_rig.core.results import ImageBoard, Observation, PatternBoard
 
 # Standard deviations of a board's pose between two cameras, m and rad: weights of translation and rotation.
 _TYPICAL = np.repeat([3e-3, 2e-3], 3)
-# Degrees of freedom of the Student distribution that weights boards, as some may be outliers.
-_STUDENT = 5.0
 
 
 class StereoPair(NamedTuple):
     """Two cameras.
 
     Attributes:
-        start: T_first_second with the captures that agree; the second camera in the LiDAR's place.
+        start: T_first_second with the captures that agree.
         joint: of these captures; the second camera is its base.
         lenses: of each camera; None for exact ones.
         rejected: the other captures in which both see the pattern.
@@ -85,25 +83,23 @@ def _refit(
     images: Mapping[str, ImageBoard], board: Board, settings: EstimateSettings
 ) -> tuple[dict[str, ImageBoard], SessionLens | None]:
     """Fit a camera's lens, unless it is known, and the boards' poses with it."""
-    corners = board.corners()
-    observations = [Observation(name, each, PatternBoard.of(each, corners)) for name, each in images.items()]
-    lens = settings.lens
+    found, lens = list(images.values()), settings.lens
     if lens is None and settings.tolerances is not None and not settings.tolerances.lens.is_exact:
-        lens = fit_session_lens({"": observations}, board, settings.tolerances.lens)
+        lens = fit_session_lens({"": found}, board, settings.tolerances.lens)
     if lens is not None:
-        observations = lens.refit(observations)
-    return {each.capture: each.image for each in observations}, lens
+        found = lens.refit_images(found)
+    return dict(zip(images, found, strict=True)), lens
 
 
 def _mean(observations: Sequence[Observation], board: Board) -> Start:
     """Average the relative poses of all captures, and predict each placement from the others."""
-    T = np.array([o.image.T_cam_board @ invert(o.lidar.T_lidar_board) for o in observations])
-    placement = group_poses(np.array([o.image.T_cam_board for o in observations]))
+    T = np.array([o.pose.T_cam_board @ invert(o.surface.T_lidar_board) for o in observations])
+    placement = group_poses(np.array([o.pose.T_cam_board for o in observations]))
     # A rotation shifts boards that are far away more; their poses are as uncertain as near ones' here.
     information = np.tile(np.diag(_TYPICAL**-2), (len(T), 1, 1))
 
     def average(keep: Array) -> Array:
-        return mean_pose(T[keep], information[keep], weigh=lambda d2: (_STUDENT + 6) / (_STUDENT + d2))[0]
+        return mean_pose(T[keep], information[keep], weigh=student_weights)[0]
 
     T_all, corners = average(np.full(len(T), True)), board.corners()
     held_out_m = np.full(len(T), np.nan)
@@ -114,8 +110,8 @@ def _mean(observations: Sequence[Observation], board: Board) -> Start:
         T_others = average(~is_here)
         for k in np.flatnonzero(is_here).tolist():
             o = observations[k]
-            there = transform(T_others @ o.lidar.T_lidar_board, corners)
-            apart = there - transform(o.image.T_cam_board, corners)
+            there = transform(T_others @ o.surface.T_lidar_board, corners)
+            apart = there - transform(o.pose.T_cam_board, corners)
             held_out_m[k] = np.sqrt(np.mean(np.sum(apart**2, axis=1)))
     # The mean pose is unique: its start needs no search.
     return Start(T_all, Certificate(True, 0.0), list(observations), {}, held_out_m, Diagnostics())

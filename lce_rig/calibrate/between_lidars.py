@@ -4,8 +4,7 @@
     find_consensus    the captures that agree on one rigid transform
     solve             Algorithm 1: the outliers, and where the estimate (`rig_estimate`) starts
 
-The first LiDAR takes the camera's place: the boards' poses in its scans are what the poses in images are to
-a camera.
+The boards' poses by the first LiDAR are compared with the second one's points and ring ends.
 
 A plate without print looks the same turned by 180 deg, a square one by 90 deg. Normals and middles of several
 boards decide T_12 without that turn, which then follows by capture.
@@ -35,7 +34,7 @@ from lce_rig.core.geometry import (
     pose,
     rotation_angle,
 )
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.results import BoardPose, LidarBoard, Observation
 
 # Plates whose sides differ by less than this share look the same turned by 90 deg.
 _NEARLY_SQUARE = 0.1
@@ -65,8 +64,7 @@ class LidarPair(NamedTuple):
         start: pose of the second by Algorithm 1, with the captures that agree.
         boards: by capture in both scans.
         alone: estimate of the boards by each LiDAR alone.
-        joint: of the same boards, with the first LiDAR's poses as if they were images: only to judge whether
-            mountings changed.
+        joint: of the same boards, from the first LiDAR's poses: only to judge whether mountings changed.
         rejected: the other captures in which both see a plate.
         T_view: (4, 4) T_optical_first.
     """
@@ -104,12 +102,10 @@ def match_lidars(
 ) -> LidarPair:
     """Find the captures that agree on the pose of the second LiDAR in an optical frame of the first.
 
-    The optical frame has the first LiDAR's origin, z level towards the boards and y down: for all checks,
-    the first LiDAR is a camera.
+    The optical frame has the first LiDAR's origin, z level towards the boards and y down.
 
     Args:
-        candidates: of each capture with the board in both scans; the first LiDAR's are the images' poses, in
-            its own frame.
+        candidates: of each capture with the board in both scans; the first LiDAR's poses in its own frame.
         first: by capture the places in its scan where the board may be.
         board: the plate.
         settings: what the profile says of each LiDAR.
@@ -137,7 +133,7 @@ def match_lidars(
             refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spin_rad)))
             continue
         lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turn)
-        observations.append(replace(o, lidar=lidar))
+        observations.append(replace(o, surface=lidar))
     if len(observations) < len(agreed) / 2:
         raise NotEnoughDataError.of(
             FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))
@@ -173,14 +169,13 @@ def optical_frame(middles: Array) -> Array:
 
 
 def _board_of(observation: Observation, places: Sequence[LidarBoard]) -> LidarBoard:
-    """Choose the place in the first LiDAR's scan whose pose an observation has as the image's."""
-    middle = observation.image.T_cam_board[:3, 3]
+    """Choose the place in the first LiDAR's scan whose pose an observation has."""
+    middle = observation.pose.T_cam_board[:3, 3]
     return min(places, key=lambda each: float(np.linalg.norm(each.T_lidar_board[:3, 3] - middle)))
 
 
 def _with_pose(observation: Observation, T: Array, cov: Array) -> Observation:
-    image = replace(observation.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None)
-    return replace(observation, image=image)
+    return replace(observation, pose=BoardPose(T, cov, None, np.inf))
 
 
 def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:

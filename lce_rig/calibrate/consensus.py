@@ -22,7 +22,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import ImageBoard, Observation
+from lce_rig.core.results import BoardPose, Observation
 
 # Three planes determine six unknowns.
 _MIN_CAPTURES = 3
@@ -101,10 +101,10 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
     for k, item in enumerate(candidates):
         if chosen[k] >= 0:
             is_alternative = pairs.pose[chosen[k]] == 1
-            T_cam_board = camera_poses(item.image)[pairs.pose[chosen[k]]]
-            image = replace(item.image, T_cam_board=T_cam_board) if is_alternative else item.image
-            lidar = item.places[pairs.candidate[chosen[k]]]
-            observations.append(replace(item, image=image, lidar=lidar, others=()))
+            T_cam_board = open_poses(item.pose)[pairs.pose[chosen[k]]]
+            board_pose = replace(item.pose, T_cam_board=T_cam_board) if is_alternative else item.pose
+            surface = item.places[pairs.candidate[chosen[k]]]
+            observations.append(replace(item, pose=board_pose, surface=surface, others=()))
         else:
             rows = np.flatnonzero(pairs.capture == k)
             nearest = rows[np.argmin(r2[rows])]
@@ -124,31 +124,31 @@ def agrees_with(item: Observation, T_cam_lidar: Array) -> bool:
     return bool(r2.min() < 1)
 
 
-def camera_poses(image: ImageBoard) -> list[Array]:
-    """List the poses (4, 4) of the board that an image leaves open."""
-    if image.T_cam_board_alternative is None or image.chi2_gap > _MAX_CHI2_GAP:
-        return [image.T_cam_board]
-    return [image.T_cam_board, image.T_cam_board_alternative]
+def open_poses(seen: BoardPose) -> list[Array]:
+    """List the poses (4, 4) of the board that the first sensor leaves open."""
+    if seen.T_cam_board_alternative is None or seen.chi2_gap > _MAX_CHI2_GAP:
+        return [seen.T_cam_board]
+    return [seen.T_cam_board, seen.T_cam_board_alternative]
 
 
 def _list_pairs(candidates: Sequence[Observation]) -> _Pairs:
     index = [
         (k, p, c)
         for k, item in enumerate(candidates)
-        for p in range(len(camera_poses(item.image)))
+        for p in range(len(open_poses(item.pose)))
         for c in range(len(item.places))
     ]
-    T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index])
-    lidars = [candidates[k].places[c] for k, _, c in index]
+    T_cam = np.array([open_poses(candidates[k].pose)[p] for k, p, _ in index])
+    surfaces = [candidates[k].places[c] for k, _, c in index]
     columns = np.array(index, dtype=np.intp)
     return _Pairs(
         capture=columns[:, 0],
         pose=columns[:, 1],
         candidate=columns[:, 2],
         normal_cam=T_cam[:, :3, 2],
-        normal_lidar=np.array([board.plane[:3] for board in lidars]),
+        normal_lidar=np.array([board.plane[:3] for board in surfaces]),
         centre_cam=T_cam[:, :3, 3],
-        centre_lidar=np.array([board.T_lidar_board[:3, 3] for board in lidars]),
+        centre_lidar=np.array([board.T_lidar_board[:3, 3] for board in surfaces]),
     )
 
 

@@ -171,7 +171,8 @@ def _with_session_lens(
     """Fit the lens of a profile that is not exact, if it is not known yet, and the boards' poses with it."""
     if settings.tolerances is None or settings.tolerances.lens.is_exact:
         return candidates, settings
-    lens = settings.lens or fit_session_lens(candidates, board, settings.tolerances.lens)
+    images = {name: [o.image for o in observations] for name, observations in candidates.items()}
+    lens = settings.lens or fit_session_lens(images, board, settings.tolerances.lens)
     refitted = {name: lens.refit(observations) for name, observations in candidates.items()}
     return refitted, replace(settings, lens=lens)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import BoardSurface, ImageBoard, LidarBoard, Observation
 from lce_rig.rig import Rig
 
 SAME_PLACE_M = 0.03
@@ -119,18 +119,18 @@ def join_scans(
 
 
 def scan_key(observation: Observation) -> bytes:
-    """Identify the board of a scan by its points."""
-    return board_key(observation.lidar)
+    """Identify the board that the second sensor saw by its points."""
+    return board_key(observation.surface)
 
 
-def board_key(lidar: LidarBoard) -> bytes:
-    """Identify a board in a scan by its points."""
-    return lidar.points.tobytes()
+def board_key(surface: BoardSurface) -> bytes:
+    """Identify a board by the points on it."""
+    return surface.points.tobytes()
 
 
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
-    """Number the board placements (F,) of captures by the camera's poses of the board."""
-    poses = np.array([observation.image.T_cam_board for observation in observations])
+    """Number the board placements (F,) of captures by the first sensor's poses of the board."""
+    poses = np.array([observation.pose.T_cam_board for observation in observations])
     return group_poses(poses.reshape(-1, 4, 4))
 
 

@@ -104,18 +104,19 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
         half_step: move ring ends outwards by half an azimuth step, to where the edge is expected: the edge
             lies between the last ray that met the board and the next one. Without it, they are as measured.
     """
-    lidar = observation.lidar
-    ends = np.asarray(lidar.edge_points, dtype=np.float64)
-    if half_step:
-        ends = turn_about_z(ends, lidar.edge_side * lidar.azimuth_step_rad / 2)
+    surface, ends = observation.surface, np.zeros((0, 3))
+    if isinstance(surface, LidarBoard):
+        ends = np.asarray(surface.edge_points, dtype=np.float64)
+        if half_step:
+            ends = turn_about_z(ends, surface.edge_side * surface.azimuth_step_rad / 2)
     return CaptureFeatures(
         capture=observation.capture,
         board=board,
-        plane_points=_meet_plane(np.asarray(lidar.points, dtype=np.float64), lidar.plane),
-        edge_points=_meet_plane(ends, lidar.plane),
-        lidar_normal=lidar.plane[:3],
-        T_cam_board=observation.image.T_cam_board,
-        cov=observation.image.cov,
+        plane_points=_meet_plane(np.asarray(surface.points, dtype=np.float64), surface.plane),
+        edge_points=_meet_plane(ends, surface.plane),
+        lidar_normal=surface.plane[:3],
+        T_cam_board=observation.pose.T_cam_board,
+        cov=observation.pose.cov,
     )
 
 

@@ -13,7 +13,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, PoseDifference, rotation_angle, sigma_sizes
-from lce_rig.core.results import Observation
+from lce_rig.core.results import ImageBoard, Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class CalibrationEstimate:
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
-        lens_of_base: the same of a camera in the LiDAR's place.
+        lens_of_base: the same of the second of two cameras.
         cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -118,6 +118,13 @@ class CalibrationEstimate:
     def metrics(self) -> Metrics:
         """Errors over all captures used, of the boards as measured."""
         return summarise(self.residuals)
+
+    @property
+    def as_start(self) -> Start:
+        """The solution from which another estimate of the same captures begins."""
+        held_out_m = np.array([residual.held_out_m for residual in self.residuals])
+        seen = list(self.observations.values())
+        return Start(self.T_cam_lidar, self.certificate, seen, self.refused, held_out_m, self.diagnostics)
 
     def captures_of(self, names: Iterable[str]) -> set[str]:
         """Name every capture that holds the scan of one of the captures named."""
@@ -166,8 +173,8 @@ def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagn
 
 
 def lever_arm(observations: Sequence[Observation]) -> float:
-    """Compute the rms distance of the boards from the camera, m: displacement by a rotation of 1 rad."""
-    centres = [observation.image.T_cam_board[:3, 3] for observation in observations]
+    """Compute the rms distance of the boards from the first sensor, m: displacement by a turn of 1 rad."""
+    centres = [observation.pose.T_cam_board[:3, 3] for observation in observations]
     return float(np.sqrt(np.mean([centre @ centre for centre in centres])))
 
 
@@ -178,10 +185,10 @@ def squares_scale(diagnostics: Diagnostics) -> float:
 
 
 def with_squares(observation: Observation, squares: float) -> Observation:
-    """Move the image's board to the distance that squares of `squares` times the size mean."""
-    T_cam_board = observation.image.T_cam_board.copy()
+    """Move the first sensor's board to the distance that squares of `squares` times the size mean."""
+    T_cam_board = observation.pose.T_cam_board.copy()
     T_cam_board[:3, 3] *= squares
-    return replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
+    return replace(observation, pose=replace(observation.pose, T_cam_board=T_cam_board))
 
 
 def capture_residual(
@@ -204,8 +211,9 @@ def capture_residual(
         squares: size of the squares relative to that by which the image's board was posed.
     """
     observation = with_squares(observation, squares)
+    pose = observation.pose
     features = extract_features(observation, board, half_step=False)
-    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
+    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.surface.points))
     edge = board.outline_distance(ends_on_board(features, T_cam_lidar))
     return CaptureResidual(
         capture=observation.capture,
@@ -214,7 +222,7 @@ def capture_residual(
         edge_mean_m=_mean(edge),
         edge_rms_m=_rms(edge),
         held_out_m=held_out_m,
-        reprojection_px=observation.image.reprojection_px,
+        reprojection_px=pose.reprojection_px if isinstance(pose, ImageBoard) else float("nan"),
     )
 
 

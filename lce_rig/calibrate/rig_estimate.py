@@ -18,7 +18,7 @@ from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Layout, State
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES
-from lce_rig.calibrate.likelihood.rays import StackedScans, interior, spread, stack_scans
+from lce_rig.calibrate.likelihood.rays import StackedScans, interior, no_scans, spread, stack_scans
 from lce_rig.calibrate.likelihood.rig import RigEstimate, maximise_rig, relate
 from lce_rig.calibrate.observations import board_key, group_poses
 from lce_rig.calibrate.quadratics import jackknife_scatter
@@ -135,7 +135,7 @@ def estimate_rig(
     result = RigResult(of_cameras, of_lidars, {}, joint)
     estimates: dict[SensorPair, CalibrationEstimate] = {}
     for pair, alone in cameras.items():
-        start = _start_of(alone, conflicts)
+        start = _without(conflicts, alone.as_start, alone.same_scan)
         T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
         c = of_cameras.index(pair[0])
         optics = joint.terms.base.state.layout.optics(c)
@@ -150,7 +150,7 @@ def estimate_rig(
             association=alone.association,
         )
     for pair, given in between.items():
-        start = _start_of(given.start, conflicts)
+        start = _without(conflicts, given.start, {})
         T, J = relate(result.on_base(pair[0]), result.on_base(pair[1]))
         if isinstance(given, StereoPair):
             estimates[pair] = replace(
@@ -213,9 +213,9 @@ class _Frames:
 
     def stack_scans(self, base: str, board: Board) -> StackedScans:
         """Stack a LiDAR's scans; those of a camera that is the base have no returns."""
-        boards = self.boards.get(base) or {
-            frame: PatternBoard.of(image, board.corners()) for frame, image in self.images[base].items()
-        }
+        boards = self.boards.get(base)
+        if not boards:
+            return no_scans(self.n)
         frames = sorted(boards)
         found = [interior(boards[frame], board) for frame in frames]
         return spread(stack_scans(found, board), np.array(frames), self.n)
@@ -344,13 +344,14 @@ def _list_images(
     pair: SensorPair, given: StereoPair, lenses: Mapping[str, SessionLens | None]
 ) -> Iterator[_Seen]:
     """List what two cameras saw."""
-    first = list(given.start.observations)
-    second = [replace(o, image=o.lidar.image) for o in first if isinstance(o.lidar, PatternBoard)]
-    for name, observations, lens in zip(pair, (first, second), given.lenses, strict=True):
+    observations = given.start.observations
+    first = [o.image for o in observations]
+    second = [o.surface.image for o in observations if isinstance(o.surface, PatternBoard)]
+    for name, images, lens in zip(pair, (first, second), given.lenses, strict=True):
         best = lenses[name]
-        found = observations if best is None or best is lens else best.refit(observations)
-        for o in found:
-            yield _Seen((name, _other_of(pair, name)), o.capture, {}, o.image)
+        found = images if best is None or best is lens else best.refit_images(images)
+        for o, image in zip(observations, found, strict=True):
+            yield _Seen((name, _other_of(pair, name)), o.capture, {}, image)
 
 
 def _other_of(pair: SensorPair, name: str) -> str:
@@ -430,27 +431,16 @@ def _weigh_cameras(
     return scaled, dict(zip(OF_IMAGES, np.exp(mean).tolist(), strict=True))
 
 
-def _start_of(own: CalibrationEstimate | Start, conflicts: Mapping[str, Refusal]) -> Start:
-    """Remove captures with conflicts, and figures that apply to the pair alone."""
-    if isinstance(own, Start):
-        kept = [k for k, o in enumerate(own.observations) if o.capture not in conflicts]
-        mine = {o.capture: conflicts[o.capture] for o in own.observations if o.capture in conflicts}
-        return Start(
-            own.T_cam_lidar,
-            own.certificate,
-            [own.observations[k] for k in kept],
-            {**own.refused, **mine},
-            own.held_out_m[kept],
-            own.diagnostics,
-        )
-    singles = {name: own.captures_of([name]) for name in own.used}
-    residuals = [residual for residual in own.residuals if not singles[residual.capture] & conflicts.keys()]
-    mine = {name: why for name, why in conflicts.items() if name in set().union(*singles.values())}
+def _without(conflicts: Mapping[str, Refusal], own: Start, same_scan: Mapping[str, tuple[str, ...]]) -> Start:
+    """Remove captures with conflicts, and those that hold the same scan, from a pair's own."""
+    held = [same_scan.get(o.capture, (o.capture,)) for o in own.observations]
+    kept = [k for k, names in enumerate(held) if not conflicts.keys() & names]
+    mine = {name: why for name, why in conflicts.items() if name in set().union(*held)}
     return Start(
         own.T_cam_lidar,
         own.certificate,
-        [own.observations[residual.capture] for residual in residuals],
+        [own.observations[k] for k in kept],
         {**own.refused, **mine},
-        np.array([residual.held_out_m for residual in residuals]),
+        own.held_out_m[kept],
         own.diagnostics,
     )

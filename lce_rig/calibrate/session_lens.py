@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.observations import group_poses
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
@@ -87,8 +87,12 @@ class SessionLens:
         return np.moveaxis(np.tensordot(axes, moves, axes=1), 0, -1), of_lens, by_lens @ of_lens.T
 
     def refit(self, observations: Sequence[Observation]) -> list[Observation]:
-        """Fit the poses of observations anew with this lens and board."""
-        boards = [observation.image for observation in observations]
+        """Fit the poses in the images of observations anew with this lens and board."""
+        images = self.refit_images([each.image for each in observations])
+        return [replace(each, pose=image) for each, image in zip(observations, images, strict=True)]
+
+    def refit_images(self, boards: Sequence[ImageBoard]) -> list[ImageBoard]:
+        """Fit the poses of boards anew with this lens and board."""
         corners_px = np.array([board.corners_px for board in boards])
         F, n = len(boards), np.isfinite(corners_px[..., 0]).sum(axis=1)
         has_other = np.array([board.T_cam_board_alternative is not None for board in boards])
@@ -113,42 +117,39 @@ class SessionLens:
         ]
         return [
             replace(
-                observation,
-                image=replace(
-                    observation.image,
-                    T_cam_board=T[k],
-                    track_T_cam_board=tracks[k],
-                    cov=cov[k],
-                    T_cam_board_alternative=T_other[k] if has_other[k] else None,
-                    chi2_gap=float(gap[k]),
-                    reprojection_px=float(np.sqrt(cost[k] / n[k])),
-                    sigma_px=float(np.sqrt(variance[k])),
-                ),
+                board,
+                T_cam_board=T[k],
+                track_T_cam_board=tracks[k],
+                cov=cov[k],
+                T_cam_board_alternative=T_other[k] if has_other[k] else None,
+                chi2_gap=float(gap[k]),
+                reprojection_px=float(np.sqrt(cost[k] / n[k])),
+                sigma_px=float(np.sqrt(variance[k])),
             )
-            for k, observation in enumerate(observations)
+            for k, board in enumerate(boards)
         ]
 
 
 def fit_session_lens(
-    candidates: Mapping[str, Sequence[Observation]], board: Board, prior: LensPrior
+    images: Mapping[str, Sequence[ImageBoard]], board: Board, prior: LensPrior
 ) -> SessionLens:
     """Fit the lens that all channels of a camera share, and the board's shape.
 
     Args:
-        candidates: by channel, of each capture.
+        images: by channel, of each capture.
         board: its specification.
         prior: the profile's intrinsics.
 
     Raises:
         NotEnoughDataError: no channel has a board, or boards and profile leave the intrinsics undetermined.
     """
-    every = [(channel, o) for channel, observations in candidates.items() for o in observations]
+    every = [(channel, image) for channel, of_channel in images.items() for image in of_channel]
     thinned = every[:: max(1, -(-len(every) // _MAX_VIEWS))]
-    placement = group_placements([observation for _, observation in thinned])
+    placement = group_poses(np.array([image.T_cam_board for _, image in thinned]).reshape(-1, 4, 4))
     # Images of one placement share its errors.
     views = [
-        BoardView(f"{number:06d}", channel, observation.image)
-        for number, (channel, observation) in zip(placement.tolist(), thinned, strict=True)
+        BoardView(f"{number:06d}", channel, image)
+        for number, (channel, image) in zip(placement.tolist(), thinned, strict=True)
     ]
     estimate = estimate_intrinsics(views, board, prior.lens, model_of(prior.lens), prior=prior, n_folds=0)
     return SessionLens(estimate, prior)

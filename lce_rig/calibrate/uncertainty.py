@@ -138,7 +138,7 @@ def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
     A board that moves by (d, phi) looks to the LiDAR as if the extrinsics moved by
     (-d - phi x (t - c), -phi), c the board's place.
     """
-    levers = start.T_cam_lidar[:3, 3] - [o.image.T_cam_board[:3, 3] for o in start.fitted]
+    levers = start.T_cam_lidar[:3, 3] - [o.pose.T_cam_board[:3, 3] for o in start.fitted]
     shifts = -moves[:, :, :3] - np.cross(moves[:, :, 3:], levers)
     alike = np.concatenate([shifts, -moves[:, :, 3:]], axis=2)
     changes = np.einsum("kij,nkj->ni", start.cost.hessians[:, :, :6], alike)

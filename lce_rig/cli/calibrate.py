@@ -1,6 +1,7 @@
 """`lce-rig calibrate`: estimate the extrinsics of a session, judge them and write them as files."""
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
 
@@ -185,7 +186,7 @@ def calibrate(
     with show.progress_bar("detecting") as progress:
         detections = lce.detect_boards(opened, progress=progress)
     show.warn_of(unlike_models(opened, detections))
-    for absent in absent_channels(rig, detections, channels):
+    for absent in chain(*absent_channels(rig, detections, channels).values()):
         show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
     with show.progress_bar("calibrating") as progress:
         try:

@@ -15,10 +15,10 @@ from lce_rig.cli import show
 from lce_rig.cli.options import explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.core.results import BoardPose, BoardSurface
+from lce_rig.detect.detection import Detections, Pair, PoseDetection, SurfaceDetection
 from lce_rig.detect.findings import IMAGE_MISFIT
-from lce_rig.pipeline.detect_session import association_errors, candidates_of, match_sensors, unlike_models
+from lce_rig.pipeline.detect_session import association_errors, match_sensors, unlike_models
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
@@ -48,21 +48,21 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         show.note(f"debug images: {folder}")
     documents, n_usable, is_contradicted = [], 0, False
     for pair in [*detections.pairs, *detections.peers(opened.rig.lidars)]:
-        seen = detections.between(pair, opened.rig.board.to_board())
-        refused, _ = match_sensors(opened.rig, seen, pair)
-        plates = _plates(opened.rig, seen, pair, refused)
-        usable = [each for each in candidates_of(seen, pair)[0] if each.capture not in refused]
+        board = opened.rig.board.to_board()
+        refused, _ = match_sensors(opened.rig, detections, pair)
+        plates = _plates(opened.rig, detections, pair, refused)
+        usable = [each for each in detections.candidates(pair, board)[0] if each.capture not in refused]
         numbers = group_placements(usable).tolist()
         placements = {each.capture: number for each, number in zip(usable, numbers, strict=True)}
         records = {
-            name: _record(*seen.of(pair, name), refused.get(name)) | {"placement": placements.get(name)}
-            for name in seen.captures(pair)
+            name: _record(*both, refused.get(name)) | {"placement": placements.get(name)}
+            for name, both in detections.between(pair, board).items()
         }
         sensors = {"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar}
         documents.append({**sensors, "captures": records, "findings": plates})
         if not as_json:
             if explain:
-                show.print_table(_table(seen, pair, records))
+                show.print_table(_table(detections, pair, records))
             show.print_parts(_head(pair, records, refused, opened.rig.quality.min_captures))
             show.print_parts(_causes([*records], refused, plates, str(session), is_whole=explain))
             show.print_parts(_repeated(placements, is_whole=explain))
@@ -89,9 +89,8 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     """
     from lce_rig.judge.verdict import distance_findings, plate_findings
 
-    scans: list[LidarBoard | Refusal] = []
-    for name in detections.captures(pair):
-        scan = detections.of(pair, name)[1]
+    board, scans = rig.board.to_board(), list[BoardSurface | Refusal]()
+    for name, (_, scan) in detections.between(pair, board).items():
         if isinstance(scan, Refusal):
             scans.append(scan)
         elif name not in refused or refused[name].stage == "image":
@@ -99,20 +98,20 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     association = association_errors(rig, detections, pair) if pair.channel else []
     if any(is_of_all(each) for each in association):
         return association
-    both = candidates_of(detections, pair)[0]
-    in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
-    in_lidar = np.array([each.lidar.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
+    both = detections.candidates(pair, board)[0]
+    in_camera = np.array([each.pose.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
+    in_lidar = np.array([each.surface.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
     of_distances = []
     if pair.channel:
         n_misfits = sum(refusal.code == IMAGE_MISFIT.code for refusal in refused.values())
         of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m, n_misfits=n_misfits)
-    return [*association, *of_distances, *plate_findings(scans, rig.board.to_board())]
+    return [*association, *of_distances, *plate_findings(scans, board)]
 
 
-def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:
+def _record(pose: PoseDetection, surfaces: SurfaceDetection, refusal: Refusal | None) -> dict[str, Any]:
     """Describe a capture for programs; figures that were not measured are null."""
 
-    def figures(detected: ImageBoard | LidarBoard | Refusal) -> dict[str, float | None] | None:
+    def figures(detected: BoardPose | BoardSurface | Refusal) -> dict[str, float | None] | None:
         if isinstance(detected, Refusal):
             return None
         values = detected.figures().items()
@@ -121,9 +120,9 @@ def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | Non
     return {
         "is_usable": refusal is None,
         "refusal": None if refusal is None else refusal.as_json(),
-        "image": figures(image),
-        "lidar": figures(lidar[0] if isinstance(lidar, list) else lidar),
-        "n_surfaces": len(lidar) if isinstance(lidar, list) else 0,
+        "image": figures(pose),
+        "lidar": figures(surfaces if isinstance(surfaces, Refusal) else surfaces[0]),
+        "n_surfaces": 0 if isinstance(surfaces, Refusal) else len(surfaces),
     }
 
 
@@ -153,7 +152,7 @@ _SIDE_SIGMA_MAX_M = 0.05
 
 def _table(detections: Detections, pair: Pair, records: Mapping[str, dict[str, Any]]) -> Any:
     """List the captures, in columns that fit a terminal of 80 characters."""
-    images = [detections.of(pair, name)[0] for name in records]
+    images = detections.images.get((pair.camera, pair.channel), {}).values()
     # Images from events have their own figures.
     is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
     columns = (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
 _STEPS, _SETTLED = 20, 1e-10
+# Degrees of freedom of the Student distribution that weights poses, as some may be outliers.
+_STUDENT = 5.0
 # 99 % of the chi-squared distribution with six degrees of freedom.
 _SURPRISING_CHI2 = 16.81
 
@@ -289,6 +291,11 @@ def mean_pose(
         if np.linalg.norm(step) < _SETTLED:
             break
     return mean, weight
+
+
+def student_weights(chi2: Array) -> Array:
+    """Weight poses (K,) for `mean_pose` by their squared distances from the mean, as some may be outliers."""
+    return np.asarray((_STUDENT + 6) / (_STUDENT + chi2))
 
 
 def relative_pose(T_second: Array, T_first: Array) -> tuple[Array, Array]:

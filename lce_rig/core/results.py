@@ -86,16 +86,44 @@ class LidarQuality:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageBoard:
-    """The board detected in one image.
+class BoardPose:
+    """The board's pose in the frame of the first of two sensors: of a camera, or of a LiDAR.
+
+    Attributes:
+        T_cam_board: (4, 4), the likeliest pose.
+        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
+        T_cam_board_alternative: (4, 4) second pose that fits; None if there is none.
+        chi2_gap: excess of the alternative's cost, in units of the noise's variance.
+    """
+
+    T_cam_board: Array
+    cov: Array
+    T_cam_board_alternative: Array | None
+    chi2_gap: float
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the board's origin from the sensor."""
+        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the board's normal and the line of sight."""
+        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
+        return float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        return {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBoard(BoardPose):
+    """The board detected in one image; T_cam_board has the smaller reprojection error.
 
     Attributes:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, of boards whose
             markers name the corners.
-        T_cam_board: (4, 4), the pose with the smaller reprojection error.
-        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
-        T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
-        chi2_gap: excess of the alternative's cost, in units of the corner variance.
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -108,10 +136,6 @@ class ImageBoard:
     """
 
     corners_px: Array
-    T_cam_board: Array
-    cov: Array
-    T_cam_board_alternative: Array | None
-    chi2_gap: float
     reprojection_px: float
     sigma_px: float
     quality: ImageQuality | None = None
@@ -121,32 +145,40 @@ class ImageBoard:
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
 
-    @property
-    def distance_m(self) -> float:
-        """Distance of the pattern's middle from the camera."""
-        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle between the board's normal and the line of sight."""
-        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
-        return float(np.degrees(np.arccos(min(cosine, 1.0))))
-
     def figures(self) -> dict[str, float]:
         """List every figure by name, for tables and programs."""
         figures = {} if self.quality is None else asdict(self.quality)
         figures["corner_rms_px"] = self.reprojection_px
-        figures |= {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+        figures |= super().figures()
         measured = {} if self.events is None else asdict(self.events)
         return figures | {name: value for name, value in measured.items() if not math.isnan(value)}
 
 
 @dataclass(frozen=True, eq=False)
-class LidarBoard:
-    """The board detected in one scan, frame lidar.
+class BoardSurface:
+    """Points on the board in the frame of the second of two sensors.
 
     Attributes:
         points: (N, 3) on the board as measured, m.
+        plane: (4,) as (n, d), n.p + d = 0, unit n towards the sensor (d > 0).
+        T_lidar_board: (4, 4) of the board in the sensor's frame; from a scan it is known up to the symmetries
+            of a rectangle.
+    """
+
+    points: Array
+    plane: Array
+    T_lidar_board: Array
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        return {"n_points": len(self.points), "distance_m": float(np.linalg.norm(self.T_lidar_board[:3, 3]))}
+
+
+@dataclass(frozen=True, eq=False)
+class LidarBoard(BoardSurface):
+    """The board detected in one scan, frame lidar; T_lidar_board is from the template.
+
+    Attributes:
         ring: (N,) int16 of each point.
         edge_points: (M, 3) first and last point of each ring on the board, as measured, m.
         edge_ring: (M,) int16.
@@ -161,15 +193,12 @@ class LidarBoard:
         edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
             standard deviation; None where the whole border is sharp.
         azimuth_step_rad: angle between neighbouring firings of one ring.
-        plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
-        T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
         offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
         quality: figures of the plate in the scan.
         stamp_ns: of the scan; None if the recording carries no time.
     """
 
-    points: Array
     ring: NDArray[np.int16]
     edge_points: Array
     edge_ring: NDArray[np.int16]
@@ -177,9 +206,7 @@ class LidarBoard:
     edge_behind_m: Array
     edge_echo: Array
     azimuth_step_rad: float
-    plane: Array
     sigma_m: float
-    T_lidar_board: Array
     quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
@@ -209,9 +236,9 @@ class LidarBoard:
         return asdict(self.quality)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PatternBoard(LidarBoard):
-    """The board in an image of another camera: its corners are the points, and it has no ring ends.
+@dataclass(frozen=True, eq=False)
+class PatternBoard(BoardSurface):
+    """The board in an image of the second of two cameras: the points are its corners.
 
     Attributes:
         image: the detection.
@@ -221,50 +248,19 @@ class PatternBoard(LidarBoard):
 
     @classmethod
     def of(cls, image: ImageBoard, corners: Array) -> "PatternBoard":
-        """Put the corners of a board (N, 3), frame board, where an image has it, frame of its camera.
+        """Put the corners of a board (N, 3), frame board, where an image has it.
 
         Args:
             image: the detection.
             corners: `Board.corners()`.
         """
         T, is_seen = image.T_cam_board, np.isfinite(image.corners_px[:, 0])
-        points = corners[is_seen] @ T[:3, :3].T + T[:3, 3]
-        n, none, unknown = len(points), np.zeros(0), math.nan
-        quality = LidarQuality(
-            width_m=unknown,
-            height_m=unknown,
-            width_sigma_m=math.inf,
-            height_sigma_m=math.inf,
-            n_rings=0,
-            n_points=n,
-            n_ring_ends=0,
-            n_ring_ends_dropped=0,
-            plane_rms_m=unknown,
-            edge_rms_m=unknown,
-            template_m=unknown,
-            beyond_share=0.0,
-            distance_m=image.distance_m,
-        )
         normal = -T[:3, 2] * np.sign(T[:3, 2] @ T[:3, 3])
-        return cls(
-            points=points,
-            ring=np.full(n, NO_RING, dtype=np.int16),
-            edge_points=np.zeros((0, 3)),
-            edge_ring=np.zeros(0, dtype=np.int16),
-            edge_side=np.zeros(0, dtype=np.int8),
-            edge_behind_m=none,
-            edge_echo=none,
-            azimuth_step_rad=1.0,
-            plane=np.append(normal, -normal @ T[:3, 3]),
-            sigma_m=1.0,
-            T_lidar_board=T,
-            quality=quality,
-            stamp_ns=image.stamp_ns,
-            image=image,
-        )
+        points = corners[is_seen] @ T[:3, :3].T + T[:3, 3]
+        return cls(points, np.append(normal, -normal @ T[:3, 3]), T, image)
 
     @classmethod
-    def candidates(cls, image: ImageBoard, corners: Array) -> list[LidarBoard]:
+    def candidates(cls, image: ImageBoard, corners: Array) -> list["PatternBoard"]:
         """List the poses that an image leaves open; arguments as of `of`."""
         poses = [image.T_cam_board]
         if image.T_cam_board_alternative is not None:
@@ -274,19 +270,48 @@ class PatternBoard(LidarBoard):
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One board placement seen by one camera channel and one LiDAR."""
+    """One board placement seen by two sensors: a camera channel and a LiDAR, or two sensors of one kind.
+
+    Attributes:
+        capture: its name.
+        pose: of the board by the first sensor.
+        surface: by the second.
+        others: further places where the second sensor may see it.
+    """
 
     capture: str
-    image: ImageBoard
-    lidar: LidarBoard
-    others: tuple[LidarBoard, ...] = ()
+    pose: BoardPose
+    surface: BoardSurface
+    others: tuple[BoardSurface, ...] = ()
 
     @classmethod
-    def of(cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard]) -> "Observation":
-        """Pair a board in an image with its possible places in the scan, best first."""
-        return cls(capture, image, places[0], tuple(places[1:]))
+    def of(cls, capture: str, pose: BoardPose, places: Sequence[BoardSurface]) -> "Observation":
+        """Pair the first sensor's pose with the possible places for the second sensor, best first."""
+        return cls(capture, pose, places[0], tuple(places[1:]))
 
     @property
-    def places(self) -> tuple[LidarBoard, ...]:
-        """All places in the scan where the board may be, best first."""
-        return (self.lidar, *self.others)
+    def image(self) -> ImageBoard:
+        """The board in the first sensor's image.
+
+        Raises:
+            TypeError: that sensor is a LiDAR.
+        """
+        if not isinstance(self.pose, ImageBoard):
+            raise TypeError(f"{self.capture}: the first sensor is not a camera")
+        return self.pose
+
+    @property
+    def lidar(self) -> LidarBoard:
+        """The board in the second sensor's scan.
+
+        Raises:
+            TypeError: that sensor is a camera.
+        """
+        if not isinstance(self.surface, LidarBoard):
+            raise TypeError(f"{self.capture}: the second sensor is not a LiDAR")
+        return self.surface
+
+    @property
+    def places(self) -> tuple[BoardSurface, ...]:
+        """All places where the second sensor may see the board, best first."""
+        return (self.surface, *self.others)

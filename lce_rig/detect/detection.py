@@ -2,8 +2,8 @@
 
 import dataclasses
 import json
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -14,19 +14,24 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array
 from lce_rig.core.results import (
+    BoardPose,
+    BoardSurface,
     EventQuality,
     ImageBoard,
     ImageQuality,
     LidarBoard,
     LidarQuality,
+    Observation,
     PatternBoard,
 )
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
 ImageDetection = ImageBoard | Refusal
+Detection = ImageDetection | LidarDetection
+PoseDetection = BoardPose | Refusal
+SurfaceDetection = Sequence[BoardSurface] | Refusal
 
 _RECORDS: dict[type, dict[str, type]] = {
     ImageBoard: {"quality": ImageQuality, "events": EventQuality},
@@ -35,7 +40,7 @@ _RECORDS: dict[type, dict[str, type]] = {
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Image, ImageBoard, LidarBoard, Refusal)}
 
 
-def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
+def to_arrays(detection: Detection | Image) -> Arrays:
     """Flatten a detection into named arrays; figures and names travel as one JSON text.
 
     Args:
@@ -60,7 +65,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
     return arrays
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection | Image:
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Detection | Image:
     """Rebuild the detection or image from the arrays of `to_arrays`.
 
     Raises:
@@ -82,7 +87,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
 
 @dataclass(frozen=True)
 class Pair:
-    """One camera channel and one LiDAR of a rig; or two sensors of one kind, the second as the LiDAR.
+    """One camera channel and one LiDAR of a rig; or two sensors of one kind.
 
     Attributes:
         camera: a camera; the first of two LiDARs.
@@ -168,53 +173,59 @@ class Detections:
         of_cameras = [p for p in self.camera_pairs() if not {p.camera, p.lidar} <= related]
         return [*self.lidar_pairs(lidars), *of_cameras]
 
-    def between(self, pair: Pair, board: Board) -> "Detections":
-        """Put the first of two LiDARs into a camera's place, or the second of two cameras into a LiDAR's.
-
-        Boards in scans are poses, as those in images are; those in images are points. Other pairs are given
-        back unchanged.
+    def between(self, pair: Pair, board: Board) -> dict[str, tuple[PoseDetection, SurfaceDetection]]:
+        """List what both sensors of a pair saw in each of their captures, sorted.
 
         Args:
             pair: the sensors.
-            board: whose corners are points.
+            board: whose corners are the points that the second of two cameras sees.
+
+        Returns:
+            By capture the first one's poses of the board, and the second one's surfaces.
         """
-        if pair.lidar_channel:
-            seen, corners = self.images[pair.lidar, pair.lidar_channel], board.corners()
-            boards = {name: _as_scan(image, corners) for name, image in seen.items()}
-            return replace(self, lidars={pair.lidar: boards})
-        if pair.channel:
-            return self
-        images = {name: _as_image(found) for name, found in self.lidars[pair.camera].items()}
-        return replace(self, images={(pair.camera, ""): images})
+        first, second = self._pair(pair)
+        return {
+            name: (_as_pose(first[name]), _as_surfaces(second[name], board)) for name in self.captures(pair)
+        }
+
+    def candidates(self, pair: Pair, board: Board) -> tuple[list[Observation], dict[str, Refusal]]:
+        """List the captures in which both sensors detect the board; and by capture why the others do not."""
+        candidates, refused = [], {}
+        for name, (pose, surfaces) in self.between(pair, board).items():
+            if isinstance(pose, Refusal):
+                refused[name] = pose
+            elif isinstance(surfaces, Refusal):
+                refused[name] = surfaces
+            else:
+                candidates.append(Observation.of(name, pose, surfaces))
+        return candidates, refused
 
     def captures(self, pair: Pair) -> list[str]:
         """Name the captures in which both sensors of a pair have a sample, sorted."""
-        images = self.images.get((pair.camera, pair.channel), {})
-        return sorted(images.keys() & self.lidars.get(pair.lidar, {}).keys())
+        first, second = self._pair(pair)
+        return sorted(first.keys() & second.keys())
+
+    def _pair(self, pair: Pair) -> tuple[Mapping[str, Detection], Mapping[str, Detection]]:
+        """Return the detections of the first and of the second sensor, by capture."""
+        first, second = (
+            self.images.get((name, channel), {}) if channel else self.lidars.get(name, {})
+            for name, channel in ((pair.camera, pair.channel), (pair.lidar, pair.lidar_channel))
+        )
+        return first, second
 
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
-        """Return the detections of both sensors of a pair in one capture."""
+        """Return the detections of a camera and a LiDAR in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]
 
 
-def _as_scan(found: ImageDetection, corners: Array) -> LidarDetection:
-    """Convert the two poses that fit an image to candidates of a scan."""
-    return found if isinstance(found, Refusal) else PatternBoard.candidates(found, corners)
+def _as_surfaces(found: Detection, board: Board) -> SurfaceDetection:
+    """Put the corners where the poses that fit an image have them; return boards in a scan as they are."""
+    return PatternBoard.candidates(found, board.corners()) if isinstance(found, ImageBoard) else found
 
 
-def _as_image(found: LidarDetection) -> ImageDetection:
-    """Convert the poses of the two likeliest boards in a scan to the two poses that fit an image."""
-    if isinstance(found, Refusal):
+def _as_pose(found: Detection) -> PoseDetection:
+    """Return the poses of the two likeliest boards in a scan; those in an image as they are."""
+    if not isinstance(found, list):
         return found
     T, other = found[0].T_lidar_board, found[1].T_lidar_board if len(found) > 1 else None
-    nothing, unknown = np.zeros((0, 2)), float("nan")
-    return ImageBoard(
-        nothing,
-        T,
-        np.zeros((6, 6)),
-        other,
-        float("inf") if other is None else 0.0,
-        unknown,
-        unknown,
-        stamp_ns=found[0].stamp_ns,
-    )
+    return BoardPose(T, np.zeros((6, 6)), other, float("inf") if other is None else 0.0)

@@ -28,6 +28,7 @@ from lce_rig.core.geometry import (
     mean_pose,
     relative_covariance,
     relative_pose,
+    student_weights,
     tangent_sizes,
 )
 from lce_rig.core.results import Observation
@@ -51,8 +52,6 @@ from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Ri
 _MIN_PLACEMENTS = 4
 # Fewer placements do not determine the shape of the scatter; that of typical errors is used.
 _MIN_JACKKNIFE = 10
-# Degrees of freedom of the Student distribution that weights single boards, as some may be outliers.
-_STUDENT = 5.0
 # Exchanged cameras fit the nominal poses better by at least this, a likelihood ratio of 400.
 _EXCHANGED_CHI2 = 12.0
 
@@ -154,11 +153,11 @@ def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> Relat
     distances = np.einsum("mki,kij,mkj->mk", apart, information, apart)
     middle = T[int(np.argmin(np.median(distances, axis=1)))]
 
-    def student_weights(chi2: Array) -> Array:
+    def weigh(chi2: Array) -> Array:
         """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
-        return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
+        return student_weights(chi2 / max(float(np.median(chi2)) / 6, 1.0))
 
-    mean, weight = mean_pose(T, information, middle, student_weights)
+    mean, weight = mean_pose(T, information, middle, weigh)
     apart = difference(T, mean)
     chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
@@ -183,8 +182,8 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
 
 
 def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:
-    middles = [(T_second_first @ one.image.T_cam_board[:, 3])[:3] for one, _ in shared]
-    seen = [other.image.T_cam_board[:3, 3] for _, other in shared]
+    middles = [(T_second_first @ one.pose.T_cam_board[:, 3])[:3] for one, _ in shared]
+    seen = [other.pose.T_cam_board[:3, 3] for _, other in shared]
     return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
 
 

@@ -16,10 +16,10 @@ from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, ChannelResult, Metrics, SceneOpinion
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.planar_pose import solve_planar_pose
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import BoardSurface, ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, ImageDetection, Pair
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.judge.findings import ELSEWHERE, UNSEEN
@@ -43,12 +43,12 @@ class Meeting:
 
     measured: Observation
     at_scan_time: Observation
-    lidar_at_image_time: LidarBoard
+    lidar_at_image_time: BoardSurface
 
     @property
     def way_m(self) -> float:
         """Distance that the board's middle moved between scan and image."""
-        before, after = self.measured.lidar.T_lidar_board, self.lidar_at_image_time.T_lidar_board
+        before, after = self.measured.surface.T_lidar_board, self.lidar_at_image_time.T_lidar_board
         return float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
 
@@ -74,7 +74,7 @@ def bring_together(
     of_channel = {result.channel: result for result in results}
     timed = {name: items for name, items in observations.items() if name in of_channel}
     if channel not in timed or any(of_channel[name].time_offset_s is None for name in timed):
-        return {o.capture: Meeting(o, o, o.lidar) for o in observations.get(channel, ())}
+        return {o.capture: Meeting(o, o, o.surface) for o in observations.get(channel, ())}
     # Images of all channels by scan, those of the channel with the least noise first.
     by_scan: dict[bytes, dict[str, ImageBoard]] = {}
     for name in sorted(timed, key=lambda name: of_channel[name].noise_px):
@@ -98,7 +98,7 @@ def bring_together(
 
 def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
     """Move the LiDAR's board from the time of the scan to that of the image."""
-    moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.image.T_cam_board) @ T_cam_lidar
+    moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.pose.T_cam_board) @ T_cam_lidar
     lidar = swept.lidar
     return replace(
         lidar,
@@ -119,9 +119,9 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
         board: its size weighs angles against distances.
         T_cam_lidar: (4, 4).
     """
-    poses = [candidates.image.T_cam_board]
-    if candidates.image.T_cam_board_alternative is not None:
-        poses.append(candidates.image.T_cam_board_alternative)
+    poses = [candidates.pose.T_cam_board]
+    if candidates.pose.T_cam_board_alternative is not None:
+        poses.append(candidates.pose.T_cam_board_alternative)
     arm_m = np.hypot(board.width_m, board.height_m) / 2
 
     def misfit(pair: tuple[int, int]) -> float:
@@ -134,8 +134,8 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
     pose_index, lidar_index = min(
         itertools.product(range(len(poses)), range(len(candidates.places))), key=misfit
     )
-    image = replace(candidates.image, T_cam_board=poses[pose_index])
-    return replace(candidates, image=image, lidar=candidates.places[lidar_index], others=())
+    pose = replace(candidates.pose, T_cam_board=poses[pose_index])
+    return replace(candidates, pose=pose, surface=candidates.places[lidar_index], others=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +224,8 @@ def check_session(
         for meeting in meetings.values()
     ]
     metrics = summarise(residuals) if residuals else None
-    both = (detections.of(pair, name) for name in detections.captures(pair))
-    n_seen = sum(isinstance(image, ImageBoard) and isinstance(lidar, list) for image, lidar in both)
+    both = detections.between(pair, board).values()
+    n_seen = sum(not any(isinstance(found, Refusal) for found in each) for each in both)
     findings = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
     # A result of this session has been judged by its scene; that of another may have been deployed since.
     action = "" if calibration.captures_used else "deployed"
@@ -242,6 +242,8 @@ def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration)
     for name, lens in ((c.camera, c.intrinsics), (c.lidar, c.lidar_intrinsics)):
         if lens is not None:
             lenses[name] = lens
+    if not lenses:
+        return detections
     board = rig.board.to_board()
     corners = replace(board, square_m=calibration.square_m or board.square_m).corners()
     if calibration.board_shape is not None:
@@ -309,12 +311,9 @@ def find_meetings(
         if not detections.captures(of_channel):
             continue
         observations[name] = []
-        for capture in detections.captures(of_channel):
-            image, lidar = detections.of(of_channel, capture)
-            if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
-                continue
-            matched = match_candidates(Observation.of(capture, image, lidar), board, T_cam_lidar)
-            middle = T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
-            if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
+        for candidates in detections.candidates(of_channel, board)[0]:
+            matched = match_candidates(candidates, board, T_cam_lidar)
+            middle = T_cam_lidar @ matched.surface.T_lidar_board[:, 3]
+            if np.linalg.norm(middle[:3] - matched.pose.T_cam_board[:3, 3]) < _ELSEWHERE_M:
                 observations[name].append(matched)
     return bring_together(observations, pair.channel, T_cam_lidar, results, clocks)

@@ -11,7 +11,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes
-from lce_rig.core.results import LidarBoard
+from lce_rig.core.results import BoardSurface, LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
@@ -102,7 +102,7 @@ def judge(
         *others,
         *_lens(examination, rig, is_misfit=2 * n_misfits >= len(estimate.used)),
         *examination.causes,
-        *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
+        *plate_findings([estimate.observations[name].surface for name in estimate.used], board),
         *_motion(estimate),
         *_channels(estimate, rig),
         *_times(estimate, rig, camera),
@@ -324,14 +324,15 @@ def nominal_findings(T: Array, nominal: NominalExtrinsic | None) -> list[Finding
     ]
 
 
-def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[Finding]:
+def plate_findings(scans: Iterable[BoardSurface | Refusal], board: Board) -> list[Finding]:
     """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot.
 
     If the profile's plate is larger than the true one by more than the search range for edges, one of two
     opposite edges has no ring ends, and those of the true edge are dropped.
 
     Args:
-        scans: boards, and refusals: a plate refused for its size counts as measured.
+        scans: boards, of which those in scans count, and refusals: a plate refused for its size counts as
+            measured.
         board: of the profile.
     """
     sizes: dict[str, list[tuple[float, float]]] = {"width": [], "height": []}
@@ -345,7 +346,7 @@ def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[
                 n_lacking[side] += int(is_crossed and sigma_m > PLATE_KNOWN_M)
             sizes["width"].append((q.width_m, q.width_sigma_m))
             sizes["height"].append((q.height_m, q.height_sigma_m))
-        elif scan.code == LIDAR_OTHER_SIZE.code:
+        elif isinstance(scan, Refusal) and scan.code == LIDAR_OTHER_SIZE.code:
             measured = scan.figure("measured_m"), scan.figure("sigma_m")
             sizes[str(scan.figures["side"])].append(measured)
     found = []

@@ -52,7 +52,7 @@ from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect_boards
+from lce_rig.pipeline.detect_session import boards_in, detect_boards
 from lce_rig.pipeline.findings import (
     CHANNEL_REJECTED,
     FEW_DETECTED,
@@ -236,14 +236,14 @@ def calibrate_detections(
     alone: list[_Solved] = []
     shortages: list[Finding] = []
     groups = _pairs_by_sensors(detections, cameras, channels)
-    absent = [replace(each, severity="note") for each in absent_channels(rig, detections, channels)]
+    absent = absent_channels(rig, detections, channels)
     shared = _shared_lenses(rig, detections, groups)
     for pairs in groups:
         lens = shared.get(pairs[0].camera)
         try:
-            solved_alone = _solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress)
-            own = [each for each in absent if each.subject.startswith(f"{solved_alone.camera}.")]
-            alone.append(replace(solved_alone, lacking=(*solved_alone.lacking, *own)))
+            pair = _solve(rig, detections, pairs, options or CalibrateOptions(), lens, progress)
+            notes = [replace(each, severity="note") for each in absent.get(pair.camera, ())]
+            alone.append(replace(pair, lacking=(*pair.lacking, *notes)))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
@@ -348,20 +348,20 @@ def _shared_lenses(
 ) -> dict[str, SessionLens]:
     """Fit the lens of each camera with several LiDARs once: extrinsics with other lenses differ by a turn."""
     n_lidars = Counter(pairs[0].camera for pairs in groups)
-    seen: dict[str, dict[str, dict[str, Observation]]] = {}
+    seen: dict[str, dict[str, dict[str, ImageBoard]]] = {}
     for pair in (pair for pairs in groups for pair in pairs if n_lidars[pair.camera] > 1):
-        found, _ = candidates_of(detections, pair)
+        found, _ = detections.candidates(pair, rig.board.to_board())
         if len(found) >= rig.quality.min_captures:
             of_channel = seen.setdefault(pair.camera, {}).setdefault(pair.channel, {})
-            of_channel.update({each.capture: each for each in found})
+            of_channel.update({each.capture: each.image for each in found})
     lenses = {}
     for camera, by_channel in seen.items():
         prior = Tolerances.of(rig.cameras[camera], rig.board).lens
-        observations = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
+        images = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
         # A pair that is estimated reports why its lens cannot be fitted.
         with suppress(NotEnoughDataError):
             if not prior.is_exact:
-                lenses[camera] = fit_session_lens(observations, rig.board.to_board(), prior)
+                lenses[camera] = fit_session_lens(images, rig.board.to_board(), prior)
     return lenses
 
 
@@ -383,7 +383,7 @@ def _solve(
     refused: dict[str, Refusal] = {}
     shortages: list[Finding] = []
     for pair in pairs:
-        of_channel, own_refused = candidates_of(detections, pair)
+        of_channel, own_refused = detections.candidates(pair, rig.board.to_board())
         refused = {**own_refused, **refused}
         if len(of_channel) >= n_needed:
             candidates[pair.channel] = of_channel
@@ -569,7 +569,7 @@ def _judged(
     square_m = rig.board.square_m * squares_scale(estimate.diagnostics)
     cov_lens = np.zeros((0, 0)) if estimate.lens is None else estimate.lens.estimate.cov
     cross = estimate.cov_with_lens
-    distances_m = [np.linalg.norm(o.image.T_cam_board[:3, 3]) for o in estimate.observations.values()]
+    distances_m = [np.linalg.norm(o.pose.T_cam_board[:3, 3]) for o in estimate.observations.values()]
     return Calibration(
         camera=own.camera,
         channels=tuple(channel.channel for channel in estimate.channels),

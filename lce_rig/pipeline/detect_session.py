@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from lce_rig.calibrate.association import find_association_error
-from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
+from lce_rig.calibrate.consensus import Consensus, find_consensus, open_poses
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.progress import Progress, begin, silent
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.results import BoardSurface, Observation
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair, from_arrays, to_arrays
 from lce_rig.detect.events.reconstructor import SHIPPED_NETWORK, Reconstructor
 from lce_rig.detect.events.search import find_event_board
@@ -338,20 +338,6 @@ def picture_stamp_ns(
     return None
 
 
-def candidates_of(detections: Detections, pair: Pair) -> tuple[list[Observation], dict[str, Refusal]]:
-    """List the captures in which both sensors detect the board; and by capture why the others do not."""
-    candidates, refused = [], {}
-    for name in detections.captures(pair):
-        image, lidar = detections.of(pair, name)
-        if isinstance(image, Refusal):
-            refused[name] = image
-        elif isinstance(lidar, Refusal):
-            refused[name] = lidar
-        else:
-            candidates.append(Observation.of(name, image, lidar))
-    return candidates, refused
-
-
 def boards_in(
     detections: Detections, camera: str, lidar: str, captures: Collection[str] | None = None
 ) -> Array:
@@ -359,26 +345,29 @@ def boards_in(
     poses: dict[str, Array] = {}
     for pair in detections.pairs:
         if (pair.camera, pair.lidar) == (camera, lidar):
-            poses |= {each.capture: each.image.T_cam_board for each in candidates_of(detections, pair)[0]}
+            for name in detections.captures(pair):
+                image, scan = detections.of(pair, name)
+                if not isinstance(image, Refusal) and not isinstance(scan, Refusal):
+                    poses[name] = image.T_cam_board
     chosen = [T for name, T in poses.items() if captures is None or name in captures]
     return np.array(chosen).reshape(-1, 4, 4)
 
 
 def match_sensors(
     rig: Rig, detections: Detections, pair: Pair
-) -> tuple[dict[str, Refusal], dict[str, LidarBoard]]:
+) -> tuple[dict[str, Refusal], dict[str, BoardSurface]]:
     """Choose the LiDAR's candidates that agree with the images.
 
     Returns:
         Why captures are unusable, as a sensor found no board or both disagree; and capture -> the candidate
         that is the board, where three captures agree at least.
     """
-    chosen: dict[str, LidarBoard] = {}
-    candidates, refused = candidates_of(detections, pair)
+    chosen: dict[str, BoardSurface] = {}
+    candidates, refused = detections.candidates(pair, rig.board.to_board())
     consensus = _consensus(rig, candidates)
     if consensus is not None:
         refused |= consensus.refused
-        chosen = {observation.capture: observation.lidar for observation in consensus.observations}
+        chosen = {observation.capture: observation.surface for observation in consensus.observations}
     elif len(candidates) >= 3:
         refused |= {item.capture: NO_AGREEMENT.refusal(n_captures=len(candidates)) for item in candidates}
     return dict(sorted(refused.items())), chosen
@@ -386,7 +375,7 @@ def match_sensors(
 
 def association_errors(rig: Rig, detections: Detections, pair: Pair) -> list[Finding]:
     """List the error, if any, by which images and scans of a pair do not belong together."""
-    candidates, _ = candidates_of(detections, pair)
+    candidates, _ = detections.candidates(pair, rig.board.to_board())
     consensus = _consensus(rig, candidates)
     error = find_association_error(candidates, rig.board.to_board(), consensus)
     return [] if error is None else [error]
@@ -407,7 +396,7 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
     """
     expected: dict[str, dict[str, list[Array]]] = {}
     for pair in detections.pairs:
-        candidates, _ = candidates_of(detections, pair)
+        candidates, _ = detections.candidates(pair, rig.board.to_board())
         consensus = _consensus(rig, candidates)
         n_agreeing = len(consensus.observations) if consensus else 0
         if consensus is None or n_agreeing < max(_LEAST_AGREEING, len(candidates) / 2):
@@ -418,6 +407,6 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
             image, scan = detections.of(pair, name)
             is_moved = isinstance(scan, Refusal) and scan.code == LIDAR_OTHER_ORIGIN.code
             if name not in agreeing and not isinstance(image, Refusal) and not is_moved:
-                poses = [T_lidar_cam @ T_cam_board for T_cam_board in camera_poses(image)]
+                poses = [T_lidar_cam @ T_cam_board for T_cam_board in open_poses(image)]
                 expected.setdefault(pair.lidar, {}).setdefault(name, poses)
     return expected

@@ -67,8 +67,10 @@ CHANNEL_REJECTED = warning_kind(
 )
 
 
-def absent_channels(rig: Rig, detections: Detections, wanted: Collection[str] | None) -> list[Finding]:
-    """List the channels without a capture, of cameras that have captures by another channel.
+def absent_channels(
+    rig: Rig, detections: Detections, wanted: Collection[str] | None
+) -> dict[str, list[Finding]]:
+    """List by camera the channels without a capture, of cameras that have captures by another channel.
 
     Args:
         rig: with the channels.
@@ -77,14 +79,15 @@ def absent_channels(rig: Rig, detections: Detections, wanted: Collection[str] | 
     """
     cameras = {camera for camera, _ in detections.images}
     held = ",".join(sorted({channel for _, channel in detections.images}))
-    return [
-        CHANNEL_ABSENT(f"{camera}.{channel}", held=held)
+    return {
+        camera: [
+            CHANNEL_ABSENT(f"{camera}.{channel}", held=held)
+            for channel in settings.channels
+            if (wanted is None or channel in wanted) and (camera, channel) not in detections.images
+        ]
         for camera, settings in rig.cameras.items()
-        for channel in settings.channels
         if camera in cameras
-        and (wanted is None or channel in wanted)
-        and (camera, channel) not in detections.images
-    ]
+    }
 
 
 SHORTAGE = Kind("shortage.text", "{text}", "{advice}", severity="warning")

@@ -25,7 +25,7 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
-from lce_rig.pipeline.detect_session import candidates_of, detect_boards
+from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 
@@ -85,7 +85,7 @@ def measure_lidar(
             channel = session.rig.cameras[pair.camera].channels[pair.channel]
             if pair.lidar != name or channel.kind != "frames":
                 continue
-            candidates, _ = candidates_of(detections, pair)
+            candidates, _ = detections.candidates(pair, board)
             clocks = Clocks.of(session.rig, pair.camera, pair.lidar)
             tolerances = Tolerances.of(session.rig.cameras[pair.camera], rig.board)
             # An error of the lens would move the boards as errors of the ranges do.
@@ -130,7 +130,7 @@ def _require_planes_meet(
     session: Session, observations: Sequence[Observation], board: Board, excess_m: float
 ) -> None:
     """Refuse boards that moved between image and scan, by their planes after ranges lost their excess."""
-    nearer = [replace(o, lidar=o.lidar.corrected(excess_m)) if excess_m else o for o in observations]
+    nearer = [replace(o, surface=o.lidar.corrected(excess_m)) if excess_m else o for o in observations]
     rms_m, limit_m = solve(nearer, board).diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M
     if rms_m > limit_m:
         what = f"{session.path}: camera and LiDAR board planes differ by {1e3 * rms_m:.0f} mm rms"

@@ -1,8 +1,7 @@
 """Two sensors of one kind that saw the same boards: their captures, and the judgement of their pose.
 
-In a result the first LiDAR of the profile stands in the camera's place, the second camera in the LiDAR's:
-T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired where one of
-them has no LiDAR; where both have one, its result relates them.
+In a result T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired
+where one of them has no LiDAR; where both have one, its result relates them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +28,6 @@ from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model
 from lce_rig.judge.session_check import match_candidates
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge
-from lce_rig.pipeline.detect_session import candidates_of
 from lce_rig.pipeline.findings import SHORTAGE, few_detected
 from lce_rig.rig import Rig
 
@@ -148,13 +146,15 @@ def judged_peers(rig: Rig, own: SolvedPeers, others: Sequence[Finding]) -> Calib
     (first, second), estimate, validation = own.names, own.estimate, own.validation
     n_captures = own.n_detected + len(own.refused)
     verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, own.T_view)
-    distances_m = [o.image.distance_m for o in estimate.observations.values()]
+    distances_m = [o.pose.distance_m for o in estimate.observations.values()]
     T_first, lens, other = invert(own.T_view), estimate.lens, estimate.lens_of_base
-    channels = (own.pair.channel,) if own.pair.lidar_channel else ()
-    noise_px = np.sqrt(np.mean([o.image.sigma_px**2 for o in estimate.observations.values()]))
+    channels: tuple[ChannelResult, ...] = ()
+    if own.pair.lidar_channel:
+        noise_px = np.sqrt(np.mean([o.image.sigma_px**2 for o in estimate.observations.values()]))
+        channels = (ChannelResult(own.pair.channel, len(estimate.used), float(noise_px)),)
     return Calibration(
         camera=first,
-        channels=channels,
+        channels=tuple(each.channel for each in channels),
         lidar_channel=own.pair.lidar_channel,
         lidar=second,
         T_cam_lidar=own.T_first_second,
@@ -170,7 +170,7 @@ def judged_peers(rig: Rig, own: SolvedPeers, others: Sequence[Finding]) -> Calib
         verdict=verdict,
         findings=findings,
         diagnostics=estimate.diagnostics,
-        channel_results=tuple(ChannelResult(name, len(estimate.used), float(noise_px)) for name in channels),
+        channel_results=channels,
         intrinsics=None if lens is None else lens.intrinsics,
         lidar_intrinsics=None if other is None else other.intrinsics,
         method=estimate.method,
@@ -190,7 +190,7 @@ def _solve(
 ) -> SolvedPeers:
     """Estimate the pose of two sensors; raises NotEnoughDataError."""
     names, board = (pair.camera, pair.lidar), rig.board.to_board()
-    candidates, lacking = candidates_of(detections.between(pair, board), pair)
+    candidates, lacking = detections.candidates(pair, board)
     if len(candidates) < rig.quality.min_captures:
         raise NotEnoughDataError.of(
             few_detected(str(pair), len(candidates), lacking, rig.quality.min_captures)
@@ -203,7 +203,9 @@ def _solve(
             )
             for name in names
         )
-        seen = {o.capture: (o.image, o.lidar.image) for o in candidates if isinstance(o.lidar, PatternBoard)}
+        seen = {
+            o.capture: (o.image, o.surface.image) for o in candidates if isinstance(o.surface, PatternBoard)
+        }
         given = match_cameras(seen, board, (first, second))
     else:
         first, second = (EstimateSettings.of(options, rig.lidars[name]) for name in names)
@@ -226,6 +228,5 @@ def _validate(
 
 def _seen_from(T: Array, observation: Observation) -> Observation:
     """Express the first LiDAR's pose of the board in another frame of the same origin."""
-    return replace(
-        observation, image=replace(observation.image, T_cam_board=T @ observation.image.T_cam_board)
-    )
+    pose = observation.pose
+    return replace(observation, pose=replace(pose, T_cam_board=T @ pose.T_cam_board))

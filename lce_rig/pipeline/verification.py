@@ -17,7 +17,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.board_drift import watch_boards
-from lce_rig.judge.session_check import SessionCheck, check_session, seen_by_own_lens
+from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.detect_session import detect_boards, event_channels, event_picture, match_sensors
 from lce_rig.pipeline.findings import OTHER_PROFILE
 from lce_rig.pipeline.result_files import (
@@ -104,10 +104,8 @@ class Verification:
     def _draw(self, base: Path, place: Path, progress: Progress) -> tuple[SessionCheck, ...]:
         """Draw into a folder, which will lie at a place."""
         drawn = []
-        board = self.session.rig.board.to_board()
         for check in self.checks:
             pair = check.pair
-            seen = self.detections.between(pair, board)
             name = "" if len(self.checks) == 1 else pair.folder_name
             shown, image_of = check, partial(_image, self.session, pair.camera, pair.channel)
             if check.calibration.is_of_lidars:
@@ -115,7 +113,7 @@ class Verification:
                 image_of = partial(_image, self.session, pair.camera, "", T_view=T_view)
             draw_check(
                 self.session,
-                seen,
+                self.detections,
                 shown,
                 base / name,
                 image_of=image_of,
@@ -157,22 +155,20 @@ def verify(
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
     detections = detections or detect_boards(session, progress=progress)
-    checks, board = [], session.rig.board.to_board()
+    checks = []
     for c in calibrations:
         scene = SceneOpinion(0, 0) if c.is_of_peers else hear_scene(session, detections, c)
         for channel in sorted(c.channels) or [""]:
             pair = replace(Pair.of(c), channel=channel)
-            if c.is_of_peers or pair in detections.pairs:
-                seen = seen_by_own_lens(session.rig, detections, c).between(pair, board)
-                if not seen.captures(pair):
-                    continue
-                check = check_session(session.rig, seen, c, channel, scene)
-                if (
-                    not c.captures_used and not c.is_of_cameras
-                ):  # A result of this session has been judged by these boards.
+            if detections.captures(pair):
+                check = check_session(session.rig, detections, c, channel, scene)
+                # A result of this session has been judged by these boards.
+                if not c.captures_used and not c.is_of_peers:
                     # The six axes together: residuals hide a rotation that a translation undoes.
                     key = (pair.camera, pair.channel)
-                    alone = Detections({key: seen.images[key]}, {pair.lidar: seen.lidars[pair.lidar]})
+                    alone = Detections(
+                        {key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]}
+                    )
                     watched = watch_boards(session.rig, c, channel, alone)
                     if watched is not None and watched.joint.is_changed:
                         check = replace(check, findings=(watched.joint.finding, *check.findings))

@@ -84,7 +84,7 @@ def _photograph(lens: Intrinsics, board: Board, n: int, sigma_px: float, seed: i
         solved = solve_planar_pose(pixels, board.corners(), lens)
         if solved is not None:
             start = solved.T_cam_board
-            found = ImageBoard(pixels, start, solved.cov, None, np.inf, 0.0, solved.sigma_px)
+            found = ImageBoard(start, solved.cov, None, np.inf, pixels, 0.0, solved.sigma_px)
             views.append(BoardView(f"{len(views):06d}", "frames", found))
     return views
 

@@ -54,9 +54,9 @@ def with_profile_errors(
         if image is not None:
             images[name] = image
     scans = {
-        item.capture: [_as_scanned(found, board, bows_m, offset_m) for found in item.places]
-        for item in session.candidates
-        if item.capture in images
+        name: [_as_scanned(found, board, bows_m, offset_m) for found in places]
+        for name, places in session.places.items()
+        if name in images
     }
     plate = {"width_m": float(width_m), "height_m": float(height_m)}
     profile = rig.model_copy(update={"board": rig.board.model_copy(update=plate)})
@@ -84,7 +84,7 @@ def draw_session(
         name: draw_corners(profile, T, sigma_px, rng, lens, corners)
         for name, T in session.T_cam_board.items()
     }
-    places = {item.capture: list(item.places) for item in session.candidates}
+    places = session.places
     images = {name: image for name, image in drawn.items() if image is not None and name in places}
     scans = {name: places[name] for name in images}
     return Detections({(camera, next(iter(settings.channels))): images}, {lidar: scans}), lens

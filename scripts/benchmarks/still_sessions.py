@@ -46,6 +46,11 @@ class StillSession:
     T_cam_board: dict[str, Array]
     candidates: list[Observation]
 
+    @property
+    def places(self) -> dict[str, list[LidarBoard]]:
+        """Places of the board in each scan, best first."""
+        return {o.capture: [p for p in o.places if isinstance(p, LidarBoard)] for o in self.candidates}
+
 
 def still_session(
     rig: Rig,

@@ -184,7 +184,7 @@ def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
 def with_decoy(item, decoy, *, is_first):
     """Add a rival to the LiDAR's candidates."""
     places = (decoy, *item.places) if is_first else (*item.places, decoy)
-    return replace(item, lidar=places[0], others=places[1:])
+    return replace(item, surface=places[0], others=places[1:])
 
 
 def in_use(T_cam_lidar, lens):

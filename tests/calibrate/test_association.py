@@ -27,13 +27,13 @@ def mirrored(item, side=ACROSS):
     corners = item.image.corners_px.reshape(BOARD.rows, BOARD.cols, 2)[:, ::-1].reshape(-1, 2).copy()
     corners[:, axis] = size_px - 1 - corners[:, axis]
     solved = solve_planar_pose(corners, BOARD.corners(), CAMERA)
-    return replace(item, image=board_from_pose(corners, solved))
+    return replace(item, pose=board_from_pose(corners, solved))
 
 
 def dealt(captures, sources):
     """Give every capture the image of another."""
     images = [captures[k].image for k in sources]
-    return [replace(item, image=image) for item, image in zip(captures, images, strict=True)]
+    return [replace(item, pose=image) for item, image in zip(captures, images, strict=True)]
 
 
 def error_in(captures):
@@ -96,7 +96,7 @@ def test_association_of_sound_captures_is_none(seed):
 
 @pytest.mark.parametrize("n_wrong", [2, 5, 9, N])
 def test_association_of_other_plates_is_none(captures, n_wrong):
-    wrong = [replace(item, lidar=somewhere_else(k)) for k, item in enumerate(captures[:n_wrong])]
+    wrong = [replace(item, surface=somewhere_else(k)) for k, item in enumerate(captures[:n_wrong])]
     assert error_in([*wrong, *captures[n_wrong:]]) is None
 
 
@@ -125,7 +125,7 @@ def test_calibrate_of_some_mirrored_names_it_first(captures):
 
 def test_calibrate_of_few_alike_captures_names_disagreement(captures):
     alike = [replace(captures[0], capture=f"a{k}") for k in range(4)]
-    wrong = [replace(item, lidar=somewhere_else(k)) for k, item in enumerate(captures[:7])]
+    wrong = [replace(item, surface=somewhere_else(k)) for k, item in enumerate(captures[:7])]
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(load_rig("rlfs"), detections_of([*alike, *wrong]))
     assert caught.value.finding.code == "shortage.few_agree"

@@ -78,7 +78,7 @@ def test_consensus_swapped_pose_is_corrected():
             T_cam_board_alternative=item.image.T_cam_board,
             chi2_gap=2.0,
         )
-        swapped.append(replace(item, image=image))
+        swapped.append(replace(item, pose=image))
     consensus = find_consensus(swapped + captures[4:], BOARD)
     chosen = {observation.capture: observation.image.T_cam_board for observation in consensus.observations}
     for item in captures[:4]:
@@ -86,7 +86,7 @@ def test_consensus_swapped_pose_is_corrected():
 
 
 def test_captures_that_agree_with_nothing_have_no_consensus():
-    captures = [replace(item, lidar=somewhere_else(k)) for k, item in enumerate(simulate(4, seed=6))]
+    captures = [replace(item, surface=somewhere_else(k)) for k, item in enumerate(simulate(4, seed=6))]
     with pytest.raises(NotEnoughDataError) as caught:
         find_consensus(captures, BOARD)
     assert caught.value.finding.code == "shortage.few_agree"

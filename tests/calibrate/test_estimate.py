@@ -88,7 +88,7 @@ def spoil(captures, numbers):
         shift = np.array([0.06, 0.0, 0.0])
         plane = seen.plane - np.append(np.zeros(3), seen.plane[:3] @ shift)
         lidar = replace(seen, points=seen.points + shift, edge_points=seen.edge_points + shift, plane=plane)
-        spoilt[k] = replace(captures[k], lidar=lidar)
+        spoilt[k] = replace(captures[k], surface=lidar)
     return spoilt
 
 
@@ -176,7 +176,7 @@ def test_residuals_without_ring_ends_are_nan():
     item = simulate(1, 0)[0]
     bare = replace(
         item,
-        lidar=replace(
+        surface=replace(
             item.lidar,
             edge_points=np.zeros((0, 3)),
             edge_ring=np.zeros(0, dtype=np.int16),

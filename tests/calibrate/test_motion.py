@@ -166,7 +166,7 @@ def test_motion_upside_down_image_is_turned(followed):
     captures, right = followed[0]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     flipped = [
-        replace(item, image=replace(item.image, T_cam_board=item.image.T_cam_board @ half_turn))
+        replace(item, pose=replace(item.image, T_cam_board=item.image.T_cam_board @ half_turn))
         if k % 3 == 0
         else item
         for k, item in enumerate(captures["events"])

@@ -30,13 +30,17 @@ def captures():
     return simulate(20, 1, REAL)
 
 
+def images(captures):
+    return {"frames": [each.image for each in captures]}
+
+
 @pytest.mark.parametrize(
     "errors",
     [(0.003, 4.0, -5.0, 2.0), (0.02, 10.0, -10.0, 0.0), (0.02, 0.0, 0.0, 0.0), (-0.02, 0.0, 0.0, 0.0)],
 )
 def test_session_lens_matches_true_lens(captures, errors):
     prior = replace(ROUGH, lens=with_errors(CAMERA, errors))
-    lens = fit_session_lens({"frames": as_profiled(captures, prior.lens)}, BOARD, prior)
+    lens = fit_session_lens(images(as_profiled(captures, prior.lens)), BOARD, prior)
     model = lens.estimate.model
     off = model.vector(lens.intrinsics) - model.vector(CAMERA)
     assert np.all(np.abs(off[:5]) < 3.5 * lens.estimate.sigma[:5])
@@ -48,7 +52,7 @@ def test_session_lens_rarely_contradicts(captures):
     for errors in np.random.default_rng(0).normal(size=(12, 4)) * (0.004, 3.6, 3.6, 2.2):
         prior = replace(ROUGH, lens=with_errors(CAMERA, tuple(errors)))
         seen = as_profiled(captures, prior.lens)
-        estimate = fit_session_lens({"frames": seen}, BOARD, prior).estimate
+        estimate = fit_session_lens(images(seen), BOARD, prior).estimate
         corners_px = np.array([o.image.corners_px for o in seen])
         setup = Setup.of(corners_px, BOARD, estimate.model, prior)
         lens = estimate.model.vector(estimate.intrinsics)
@@ -57,7 +61,7 @@ def test_session_lens_rarely_contradicts(captures):
 
 
 def test_an_exact_profile_stays_as_it_is(captures):
-    lens = fit_session_lens({"frames": captures}, BOARD, EXACT)
+    lens = fit_session_lens(images(captures), BOARD, EXACT)
     model = lens.estimate.model
     np.testing.assert_allclose(model.vector(lens.intrinsics), model.vector(CAMERA), rtol=1e-5)
     np.testing.assert_allclose(lens.estimate.corners_board, BOARD.corners(), atol=1e-6)
@@ -72,7 +76,7 @@ def test_the_lidar_does_not_move_the_lens(captures):
     moved = [
         replace(
             o,
-            lidar=replace(
+            surface=replace(
                 o.lidar,
                 points=transform(turned, o.lidar.points),
                 edge_points=transform(turned, o.lidar.edge_points),
@@ -97,7 +101,7 @@ def test_lens_change_moves_extrinsics(captures, method):
     poses, _, turns = lens.errors([o.image for o in estimate.observations.values()])
     poses = poses[:, :, k]
     moved = [
-        replace(o, image=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
+        replace(o, pose=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
         for o, move in zip(estimate.observations.values(), poses, strict=True)
     ]
     again = fit_extrinsic(moved, BOARD, replace(SETTINGS, method=method))

@@ -29,7 +29,7 @@ def longer(item, rings, offset_m):
     points = moved(lidar.points, lidar.ring)
     ends = moved(lidar.edge_points, lidar.edge_ring)
     plane, _ = fit_plane(points)
-    return replace(item, lidar=replace(lidar, points=points, edge_points=ends, plane=plane))
+    return replace(item, surface=replace(lidar, points=points, edge_points=ends, plane=plane))
 
 
 def linearised(captures):

@@ -32,7 +32,7 @@ def as_profiled(captures, lens=CAMERA, board=BOARD):
     found = []
     for item in captures:
         solved = solve_planar_pose(item.image.corners_px, board.corners(), lens)
-        found.append(replace(item, image=board_from_pose(item.image.corners_px, solved)))
+        found.append(replace(item, pose=board_from_pose(item.image.corners_px, solved)))
     return found
 
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -209,3 +210,14 @@ def test_sessions_that_cannot_be_meant_exit_with_4(lce_rig, session):
     marker = session / "session.json"
     marker.write_text(marker.read_text().replace("rles", "rlfs"))
     assert lce_rig("check", session).code == 4  # of an exchanged profile
+
+
+def test_verify_of_two_lidars_draws_other_results(lce_rig, tmp_path):
+    session, other = tmp_path / "session", tmp_path / "other.json"
+    profile = Path(__file__).parents[1] / "rigs" / "two_lidars.yaml"
+    assert lce_rig("simulate", session, "--rig", profile, "--captures", 6).code == 0
+    assert lce_rig("calibrate", session).code in (0, 7)
+    other.write_bytes((session / "calibration" / "result.json").read_bytes())
+    verified = lce_rig("verify", session, "--result", other)
+    assert verified.code == 0 and "front and side" in verified.out
+    assert (session / "overlays" / "000000.png").is_file()

@@ -61,7 +61,7 @@ def board_at(x_m, y_m):
     """A board that faces the camera."""
     T_cam_board = np.diag([1.0, -1.0, -1.0, 1.0])
     T_cam_board[:3, 3] = x_m, y_m, 3.0
-    return ImageBoard(np.zeros((54, 2)), T_cam_board, np.eye(6) * 1e-6, None, np.inf, 0.1, 0.1)
+    return ImageBoard(T_cam_board, np.eye(6) * 1e-6, None, np.inf, np.zeros((54, 2)), 0.1, 0.1)
 
 
 def plate():
@@ -70,4 +70,4 @@ def plate():
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)
     plane = np.array([0, 0, 1.0, -3.0])
     quality = measured_plate(0.8, 0.6, none)
-    return LidarBoard(none, ring, none, ring, side, nothing, nothing, 0.003, plane, 0.01, np.eye(4), quality)
+    return LidarBoard(none, plane, np.eye(4), ring, none, ring, side, nothing, nothing, 0.003, 0.01, quality)

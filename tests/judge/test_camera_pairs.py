@@ -91,7 +91,7 @@ def test_scaled_lens_scatters_the_boards(sound):
     for left, right in session:
         T = right.image.T_cam_board.copy()
         T[:3, 3] *= 1.03
-        longer.append((left, replace(right, image=replace(right.image, T_cam_board=T))))
+        longer.append((left, replace(right, pose=replace(right.image, T_cam_board=T))))
     plain, scaled = (pose_from_images(each) for each in (session, longer))
     assert plain.scatter < 2 < scaled.scatter
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
@@ -101,7 +101,7 @@ def test_a_board_seen_wrongly_hardly_matters(sound):
     session = observed(sound[1])
     left, right = session[3]
     wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
-    session[3] = left, replace(right, image=replace(right.image, T_cam_board=wrong))
+    session[3] = left, replace(right, pose=replace(right.image, T_cam_board=wrong))
     error = difference(pose_from_images(session).T_second_first, T_RIGHT_LEFT)
     assert np.degrees(np.linalg.norm(error[3:])) < 0.1
     assert np.linalg.norm(error[:3]) < 0.003

@@ -52,7 +52,7 @@ def through(rig: Rig, camera: str, source: str, board: Observation) -> Observati
     corners = centre + factor * (board.image.corners_px - centre)
     solved = solve_planar_pose(corners, BOARD.corners(), profile)
     assert solved is not None
-    return replace(board, image=board_from_pose(corners, solved))
+    return replace(board, pose=board_from_pose(corners, solved))
 
 
 def test_exchanged_like_cameras_are_found() -> None:

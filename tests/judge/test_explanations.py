@@ -25,7 +25,7 @@ def observed(n=16, seed=1):
 
 
 def seen_at(observation, T_cam_board):
-    return replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
+    return replace(observation, pose=replace(observation.image, T_cam_board=T_cam_board))
 
 
 def moved(observations, is_moved, tangent):
@@ -39,7 +39,7 @@ def with_points(observation, change):
     lidar = observation.lidar
     points, ends = change(lidar.points, lidar.ring), change(lidar.edge_points, lidar.edge_ring)
     return replace(
-        observation, lidar=replace(lidar, points=points, edge_points=ends, plane=fit_plane(points)[0])
+        observation, surface=replace(lidar, points=points, edge_points=ends, plane=fit_plane(points)[0])
     )
 
 

@@ -39,5 +39,5 @@ def read_by_other_table(lidar: LidarBoard, azimuth: Array, elevation: Array) -> 
 )
 def test_explain_other_beam_table_is_named(azimuth: Array, elevation: Array, cause: str) -> None:
     boards = simulate(15, 1, Scenario(laser_bias_sigma_m=0.008, footprint_m=0.006))
-    boards = [replace(o, lidar=read_by_other_table(o.lidar, azimuth, elevation)) for o in boards]
+    boards = [replace(o, surface=read_by_other_table(o.lidar, azimuth, elevation)) for o in boards]
     assert causes(boards)[0] == cause

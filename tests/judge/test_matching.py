@@ -22,5 +22,5 @@ def test_the_pose_that_the_scan_confirms_is_taken():
     right = item.image.T_cam_board
     wrong = perturb(right, np.array([0, 0, 0, 0.5, 0.3, 0]))
     swapped = replace(item.image, T_cam_board=wrong, T_cam_board_alternative=right)
-    found = match_candidates(replace(item, image=swapped), BOARD, T_FORWARD)
+    found = match_candidates(replace(item, pose=swapped), BOARD, T_FORWARD)
     np.testing.assert_array_equal(found.image.T_cam_board, right)

@@ -44,7 +44,7 @@ def taken_by_moved_lidar(lidar: LidarBoard, T: Array) -> LidarBoard:
 
 def moved(boards: list[Observation], captures: range, T: Array) -> list[Observation]:
     return [
-        replace(board, lidar=taken_by_moved_lidar(board.lidar, T)) if k in captures else board
+        replace(board, surface=taken_by_moved_lidar(board.lidar, T)) if k in captures else board
         for k, board in enumerate(boards)
     ]
 

@@ -183,7 +183,7 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of
 def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected, verdict_of):
     def resized(seen):
         quality = replace(seen.lidar.quality, width_m=factor * BOARD.width_m, width_sigma_m=0.01)
-        return replace(seen, lidar=replace(seen.lidar, quality=quality))
+        return replace(seen, surface=replace(seen.lidar, quality=quality))
 
     other = {name: resized(seen) for name, seen in estimate.observations.items()}
     verdict, reasons = verdict_of(replace(estimate, observations=other))
@@ -356,7 +356,7 @@ def test_wrong_square_size_is_measured():
         T = item.image.T_cam_board.copy()
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
-        captures.append(replace(item, image=image))
+        captures.append(replace(item, pose=image))
     wrong = fit_extrinsic(captures, BOARD, EstimateSettings())
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict != "pass" and reasons[0].code == "verdict.scale"

@@ -53,7 +53,7 @@ def photograph(n, seed, scene=None, board=BOARD):
             continue
         pixels = pixels + scene.sigma_px * rng.standard_normal(pixels.shape)
         start = perturb(T, np.r_[0.03 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
-        found = ImageBoard(pixels, start, np.eye(6), None, np.inf, 0.0, 0.0)
+        found = ImageBoard(start, np.eye(6), None, np.inf, pixels, 0.0, 0.0)
         views.append(BoardView(f"{len(views):06d}", "frames", found))
     return views
 

@@ -16,14 +16,14 @@ SEEN = {"000000": Refusal("image.none")}
 
 def test_absent_channels_events_without_captures_are_named(rles):
     detections = Detections({("davis", "frames"): SEEN}, {"lidar": SEEN})
-    (finding,) = absent_channels(rles, detections, None)
+    ((finding,),) = absent_channels(rles, detections, None).values()
     assert finding.subject == "davis.events" and finding.severity == "warning"
     assert "`lce-rig calibrate s --channels frames`" in finding.advice_at("s")
-    assert absent_channels(rles, detections, ["frames"]) == []
+    assert not any(absent_channels(rles, detections, ["frames"]).values())
 
 
 def test_absent_channels_unused_is_none(rles):
-    assert absent_channels(rles, Detections({}, {"lidar": SEEN}), None) == []
+    assert absent_channels(rles, Detections({}, {"lidar": SEEN}), None) == {}
 
 
 def test_calibrate_mirrored_channel_is_named(rlfs):

@@ -148,7 +148,7 @@ def test_boards_that_moved_keep_cameras_apart(session):
                 track_T_cam_board=poses,
                 track_cov=np.array([c.image.cov] * 4),
             )
-            found.append(replace(c, image=image, lidar=replace(c.lidar, stamp_ns=stamp_ns)))
+            found.append(replace(c, pose=image, surface=replace(c.lidar, stamp_ns=stamp_ns)))
         return found
 
     found = calibrated(detections({name: moved(captures) for name, captures in session.items()}), PAPER)

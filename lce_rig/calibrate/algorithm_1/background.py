@@ -115,5 +115,5 @@ def move_ends(
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)
-        moved.append(replace(observation, lidar=lidar))
+        moved.append(replace(observation, surface=lidar))
     return moved

@@ -18,13 +18,13 @@ from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
-from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, no_scans, stack_scans
 from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
-from lce_rig.core.results import LidarBoard, Observation, PatternBoard
+from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
 
 # Maximum number of steps between fits of the levels, and of the last steps.
 STEPS, _LAST_STEPS = 3, 20
@@ -184,7 +184,7 @@ def maximise_likelihood(
 ) -> JointEstimate:
     """Estimate extrinsics of C cameras; captures with the same name share scan and board pose.
 
-    Another camera in the LiDAR's place (`PatternBoard`) is the last one, and the base.
+    The second of two cameras (`PatternBoard`) is the last one, and the base.
 
     Args:
         cameras: observations of each.
@@ -198,7 +198,7 @@ def maximise_likelihood(
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
     base = None if len(images) == len(cameras) else len(cameras)
     by_name = {
-        o.capture: invert(T) @ o.image.T_cam_board
+        o.capture: invert(T) @ o.pose.T_cam_board
         for camera, T in zip(cameras, T_cam_lidar, strict=True)
         for o in camera
     }
@@ -218,11 +218,17 @@ def stack_captures(
     pose_ratios: Sequence[Mapping[str, float]] | None,
 ) -> tuple[tuple[str, ...], StackedScans, list[StackedImages]]:
     """Stack the captures of all cameras, sorted by name; arguments as of `maximise_likelihood`."""
-    lidars = {o.capture: o.lidar for camera in cameras for o in camera}
-    order = {name: k for k, name in enumerate(sorted(lidars))}
-    scans = stack_scans([interior(lidars[name], board) for name in order], board)
-    seen = [{o.capture: o.image for o in camera} for camera in cameras]
-    by_base = {name: b.image for name, b in lidars.items() if isinstance(b, PatternBoard)}
+    surfaces = {o.capture: o.surface for camera in cameras for o in camera}
+    order = {name: k for k, name in enumerate(sorted(surfaces))}
+    by_base = {name: each.image for name, each in surfaces.items() if isinstance(each, PatternBoard)}
+    if by_base:
+        scans = no_scans(len(order))
+    else:
+        lidars = {o.capture: o.lidar for camera in cameras for o in camera}
+        scans = stack_scans([interior(lidars[name], board) for name in order], board)
+    seen: list[Mapping[str, BoardPose]] = [{o.capture: o.pose for o in camera} for camera in cameras]
+    if by_base:
+        seen.append(by_base)
     images = [
         stack_images(
             np.array([order[name] for name in of_camera]),
@@ -230,7 +236,7 @@ def stack_captures(
             board.pattern_offset_m,
             lens,
         )
-        for of_camera, lens in zip([*seen, *([by_base] if by_base else [])], lenses, strict=True)
+        for of_camera, lens in zip(seen, lenses, strict=True)
     ]
     if pose_ratios is not None:
         images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]

@@ -170,6 +170,6 @@ def at_full_weight(
 
 def _nearest_turn(observation: Observation, T_cam_lidar: Array) -> Array:
     """Rotate the scan's pose about the plate's normal by the multiple of 90 deg nearest to the image's."""
-    expected = invert(T_cam_lidar) @ observation.image.T_cam_board
-    turned = observation.lidar.T_lidar_board @ _TURNS
+    expected = invert(T_cam_lidar) @ observation.pose.T_cam_board
+    turned = observation.surface.T_lidar_board @ _TURNS
     return np.asarray(turned[int(np.argmin(rotation_angle(turned[:, :3, :3], expected[:3, :3])))])

@@ -18,7 +18,7 @@ from lce_rig.calibrate.likelihood.layout import Indices, image_columns
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.geometry import Array, difference, skew
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import BoardPose, ImageBoard
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class StackedImages:
 
 def stack_images(
     capture: Indices,
-    images: Sequence[ImageBoard],
+    images: Sequence[BoardPose],
     pattern_offset_m: tuple[float, float] = (0.0, 0.0),
     lens: SessionLens | None = None,
 ) -> StackedImages:
@@ -73,7 +73,7 @@ def stack_images(
 
     Args:
         capture: (P,) which of the stacked captures they belong to.
-        images: P of them.
+        images: P of them, or poses by the first of two LiDARs, which have no lens.
         pattern_offset_m: of the pattern's centre from the plate's.
         lens: whose errors are unknowns; None for a lens that is exact.
     """
@@ -91,7 +91,7 @@ def stack_images(
     errors[:, :3, 1:] = -R[:, :, :2]
     of_lens, turns = np.zeros((0, 0)), np.zeros((3, 0))
     if lens is not None:
-        moves, of_lens, turns = lens.errors(images)
+        moves, of_lens, turns = lens.errors([each for each in images if isinstance(each, ImageBoard)])
         errors = np.concatenate([errors, moves], axis=2)
     return StackedImages(capture, T, cov, shapes, errors, of_lens, turns)
 

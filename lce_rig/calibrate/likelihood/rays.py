@@ -74,7 +74,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import NO_RING
 from lce_rig.core.geometry import Array
 from lce_rig.core.pattern import is_dark
-from lce_rig.core.results import LidarBoard, PatternBoard
+from lce_rig.core.results import LidarBoard
 
 # Typical noise of a cell's mean without rings.
 _MEAN_M = 0.008
@@ -135,12 +135,7 @@ class StackedScans:
 
 
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
-    """Remove returns near the border, where the beam also hits the background and reads too long.
-
-    Corners that another camera sees are no returns: `images` weighs them.
-    """
-    if isinstance(lidar, PatternBoard):
-        return replace(lidar, points=lidar.points[:0], ring=lidar.ring[:0])
+    """Remove returns near the border, where the beam also hits the background and reads too long."""
     T = lidar.T_lidar_board
     xy = ((np.asarray(lidar.points, dtype=np.float64) - T[:3, 3]) @ T[:3, :3])[:, :2]
     keep = np.all(np.abs(xy) < np.array([board.width_m, board.height_m]) / 2 - _BORDER_M, axis=1)
@@ -153,8 +148,6 @@ def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
 def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     """Stack the boards of F captures; `board` is their size."""
     rings = np.unique(np.concatenate([numbers for b in boards for numbers in (b.ring, b.edge_ring)]))
-    # Where no LiDAR saw the boards, one ring stands for its errors, which nothing measures.
-    rings = rings if len(rings) else np.array([NO_RING], dtype=np.int16)
     capture = np.repeat(np.arange(len(boards)), [len(board.points) for board in boards])
     ring = np.searchsorted(rings, np.concatenate([board.ring for board in boards]))
     points = np.concatenate([np.asarray(board.points, dtype=np.float64) for board in boards])
@@ -188,6 +181,29 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
         end_beam=np.concatenate(beams)[sorted_ends],
         end_sigma=np.concatenate(sigmas)[sorted_ends],
+    )
+
+
+def no_scans(n_captures: int) -> StackedScans:
+    """Stack captures that no LiDAR saw; one ring stands for its errors, which nothing measures."""
+    at, none, rays, fields = np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 6))
+    return StackedScans(
+        n_captures=n_captures,
+        rings=np.array([NO_RING], dtype=np.int16),
+        capture=at,
+        ring=at,
+        rays=rays,
+        range_m=none,
+        fields=fields,
+        weight=np.ones(n_captures),
+        end_capture=at,
+        end_ring=at,
+        end_rays=rays,
+        next_rays=rays,
+        end_fields=fields,
+        end_background=rays,
+        end_beam=np.zeros((0, 2)),
+        end_sigma=none,
     )
 
 

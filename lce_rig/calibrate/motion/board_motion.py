@@ -262,7 +262,7 @@ def compensate(
     """
     times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
     moved = [
-        replace(o, image=replace(o.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
+        replace(o, pose=replace(o.pose, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
         for o, T, cov in zip(observations, motions.at(times_s), motions.cov_at(times_s), strict=True)
     ]
     return deskew_points(moved, motions, T_cam_lidar)
@@ -274,7 +274,7 @@ def deskew_points(
     """Motion-compensate the points of boards to one time, as `compensate`."""
     R_cam_lidar = T_cam_lidar[:3, :3]
     rates = np.concatenate([motions.rates[:, :3] @ R_cam_lidar, motions.rates[:, 3:] @ R_cam_lidar], axis=1)
-    return [replace(o, lidar=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
+    return [replace(o, surface=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
 
 
 def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:

@@ -27,7 +27,7 @@ from lce_rig.calibrate.plane_and_ends import turn_about_z
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.collect.guidance.sensor_model import SensorModel
 from lce_rig.core.geometry import Array, invert, pose, skew
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import BoardPose
 
 # The detector does not use shorter rings as lines.
 FEWEST_POINTS = 6
@@ -225,7 +225,7 @@ class Predictor:
         model, T_lidar_board = self._model, invert(self._T_cam_lidar) @ T_cam_board
         scans = self._scans(T_lidar_board, rings)
         images = [
-            ImageBoard(np.zeros((0, 2)), T, cov, None, np.inf, _CORNER_PX, _CORNER_PX)
+            BoardPose(T, cov, None, np.inf)
             for T, cov in zip(T_cam_board, _pose_covariance(model, T_cam_board), strict=True)
         ]
         stacked = stack_images(np.arange(len(images)), images, model.board.pattern_offset_m)

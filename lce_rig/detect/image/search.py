@@ -129,7 +129,7 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
         solved: both poses that they admit.
         quality: figures of the image.
     """
-    return ImageBoard(corners_px, **solved._asdict(), quality=quality)
+    return ImageBoard(**solved._asdict(), corners_px=corners_px, quality=quality)
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:

@@ -18,7 +18,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.phrasing import sizes
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import BoardPose, BoardSurface, ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.session_check import SessionCheck
@@ -47,8 +47,8 @@ def draw_overlay(
     intrinsics: Intrinsics,
     T_cam_lidar: Array,
     *,
-    lidar_board: LidarBoard | None,
-    image_board: ImageBoard | None,
+    lidar_board: BoardSurface | None,
+    image_board: BoardPose | None,
     board: Board,
     limits_m: tuple[float, float] | None = None,
 ) -> Picture:
@@ -62,8 +62,8 @@ def draw_overlay(
         scan: points in frame lidar.
         intrinsics: the camera.
         T_cam_lidar: (4, 4) the extrinsics to judge.
-        lidar_board: its points and ring ends are marked; None for the scan only.
-        image_board: its outline and corners are drawn; None for none.
+        lidar_board: its points are marked, and ring ends of a LiDAR; None for the scan only.
+        image_board: its outline is drawn, and corners of a camera; None for none.
         board: the board, for its outline.
         limits_m: ends of the range scale; those of the scan if None.
 
@@ -78,6 +78,7 @@ def draw_overlay(
     if lidar_board is not None:
         on_board = _to_picture(lidar_board.points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_discs(picture, on_board, MAGENTA, 1.9 * unit, WHITE)
+    if isinstance(lidar_board, LidarBoard):
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
     return picture
@@ -145,12 +146,14 @@ def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
 
 
 def draw_image_board(
-    picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
+    picture: Picture, factor: int, image_board: BoardPose, board: Board, intrinsics: Intrinsics
 ) -> None:
     """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
     outline = outline_px(image_board.T_cam_board, board, intrinsics)
     width_px = max(1, round(2e-3 * picture.shape[1]))
     canvas.draw_line(picture, (outline + 0.5) * factor - 0.5, WHITE, width_px)
+    if not isinstance(image_board, ImageBoard):
+        return
     seen_px = image_board.corners_px[np.isfinite(image_board.corners_px[:, 0])]
     at = (seen_px + 0.5) * factor - 0.5
     canvas.draw_discs(picture, at, WHITE, 1.6e-3 * picture.shape[1], BLACK)
@@ -220,6 +223,7 @@ def draw_check(
         SessionError: an image cannot be written.
     """
     names, c = detections.captures(check.pair), check.calibration
+    images = detections.images.get((c.camera, check.pair.channel), {})
     scans = []
     for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
         with suppress(SessionError):
@@ -232,7 +236,7 @@ def draw_check(
         if image is not None:
             # A capture whose scan cannot be read is not drawn.
             with suppress(SessionError):
-                scan, board = scan_of(capture), detections.of(check.pair, name)[0]
+                scan, board = scan_of(capture), images.get(name)
                 picture = _draw(name, image, scan, session, check, board, limits_m)
                 canvas.write_picture(folder / f"{name}.png", picture)
                 shown.append((name, "; ".join(_figures(name, check)), _cause(name, c)))
@@ -288,7 +292,7 @@ def _draw(
     if meeting is not None:
         # The board's points are drawn separately, moved to the image's time.
         points, on_board = (
-            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.lidar.points)
+            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.surface.points)
         )
         row = np.dtype((np.void, points.dtype.itemsize * 3))
         scan = scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
@@ -298,14 +302,14 @@ def _draw(
         session.rig.lens_of(c),
         c.T_cam_lidar,
         lidar_board=None if meeting is None else meeting.lidar_at_image_time,
-        image_board=image_board if meeting is None else meeting.measured.image,
+        image_board=image_board if meeting is None else meeting.measured.pose,
         board=session.rig.board.to_board(),
         limits_m=limits_m,
     )
 
 
 def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
-    """Return a check with a camera in the first LiDAR's place, which looks at the boards.
+    """Return a check as a camera at the first LiDAR, which looks at the boards, would see it.
 
     Args:
         check: of two LiDARs.
@@ -313,15 +317,15 @@ def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
     Returns:
         The same as of that camera, and T_camera_first (4, 4).
     """
-    middles = [meeting.measured.image.T_cam_board[:3, 3] for meeting in check.meetings.values()]
+    middles = [meeting.measured.pose.T_cam_board[:3, 3] for meeting in check.meetings.values()]
     T_view = optical_frame(np.array(middles).reshape(-1, 3))
     c = check.calibration
     seen: Calibration = replace(c, T_cam_lidar=T_view @ c.T_cam_lidar, intrinsics=_WINDOW)
     meetings = {}
     for name, meeting in check.meetings.items():
-        image = meeting.measured.image
-        moved = replace(image, T_cam_board=T_view @ image.T_cam_board)
-        meetings[name] = replace(meeting, measured=replace(meeting.measured, image=moved))
+        pose = meeting.measured.pose
+        moved = replace(pose, T_cam_board=T_view @ pose.T_cam_board)
+        meetings[name] = replace(meeting, measured=replace(meeting.measured, pose=moved))
     return replace(check, calibration=seen, meetings=meetings), T_view
 
 

@@ -55,7 +55,7 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     corners = board.corners()
     squares = squares_scale(calibration.diagnostics)
     features = [extract_features(with_squares(o, squares), board, half_step=False) for o in observations]
-    plane_m = [plane_residuals(f, T, o.lidar.points) for f, o in zip(features, observations, strict=True)]
+    plane_m = [plane_residuals(f, T, o.surface.points) for f, o in zip(features, observations, strict=True)]
     residuals_px = []
     for o in observations:
         # A board that moved has its pose at the LiDAR's time; its corners are those of the image.

@@ -261,7 +261,7 @@ def picture_of(
     observation = c.observations.get(capture.name)
     outline, stamp_ns = np.empty((0, 2)), None
     if observation is not None:
-        outline = outline_px(observation.image.T_cam_board, board, lens)
+        outline = outline_px(observation.pose.T_cam_board, board, lens)
         stamp_ns = observation.image.stamp_ns
     with suppress(LceRigError):
         for channel in c.channels:

@@ -22,7 +22,7 @@ def sooner(capture, by_m, echo, behind_m):
     nearest = np.argmax(beyond, axis=1)
     outwards = np.sign(np.take_along_axis(local, nearest[:, None], axis=1)) * axis.T[nearest]
     ends = lidar.edge_points - by_m[:, None] * outwards
-    return replace(capture, lidar=replace(lidar, edge_points=ends, edge_echo=echo, edge_behind_m=behind_m))
+    return replace(capture, surface=replace(lidar, edge_points=ends, edge_echo=echo, edge_behind_m=behind_m))
 
 
 def held(capture, is_behind, echo=0.0):
@@ -40,7 +40,7 @@ def lit(capture, rng):
 
 def unaware(capture):
     nothing = np.zeros(len(capture.lidar.edge_side))
-    return replace(capture, lidar=replace(capture.lidar, edge_echo=nothing, edge_behind_m=nothing + np.inf))
+    return replace(capture, surface=replace(capture.lidar, edge_echo=nothing, edge_behind_m=nothing + np.inf))
 
 
 def error_m(captures):

@@ -85,7 +85,7 @@ def raised(capture, metres_per_rad):
         return points - metres_per_rad * elevation[:, None] * [0, 0, 1]
 
     return replace(
-        capture, lidar=replace(lidar, points=move(lidar.points), edge_points=move(lidar.edge_points))
+        capture, surface=replace(lidar, points=move(lidar.points), edge_points=move(lidar.edge_points))
     )
 
 
@@ -101,7 +101,7 @@ def test_refine_lost_laser_height_is_found():
 def test_refine_image_tilt_noise_is_found():
     rng = np.random.default_rng(0)
     tilted = [
-        replace(o, image=replace(o.image, T_cam_board=o.image.T_cam_board @ pose(exp_so3(phi), np.zeros(3))))
+        replace(o, pose=replace(o.image, T_cam_board=o.image.T_cam_board @ pose(exp_so3(phi), np.zeros(3))))
         for o, phi in zip(
             observations(30, 1, REAL), np.radians([0.4, 0.4, 0]) * rng.standard_normal((30, 3)), strict=True
         )
@@ -123,7 +123,7 @@ def bent(item, height_m):
 
     points = raised(lidar.points)
     moved = replace(lidar, points=points, edge_points=raised(lidar.edge_points), plane=fit_plane(points)[0])
-    return replace(item, lidar=moved)
+    return replace(item, surface=moved)
 
 
 def test_a_bent_plate_is_found_by_its_bow():
@@ -162,7 +162,7 @@ def test_refine_second_camera_gains_accuracy():
     for o in first:
         image = photograph(T_second @ invert(T_FORWARD) @ o.image.T_cam_board, rng, noisy, BOARD)
         if image is not None:
-            second.append(replace(o, image=image))
+            second.append(replace(o, pose=image))
     assert len(second) > 8
     priors, usual = Priors(), Levels(laser_m=0.008)
     start = perturb(T_second, np.array([0.01, -0.01, 0.01, 0.005, 0.005, -0.005]))
@@ -222,7 +222,7 @@ def test_refine_bright_wall_is_modelled():
     assert abs(joint.state.shifts[SHIFTS.index("d_1")] + 0.016) < 0.003
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
-    blind = [replace(o, lidar=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
+    blind = [replace(o, surface=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
     unaware = maximise_likelihood([blind], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
     # Shifts of single captures take its place, which say less.
     assert unaware.levels.own_shift_m > 2 * joint.levels.own_shift_m
@@ -234,7 +234,7 @@ def lighten(observation, share, sooner_m):
     held = hold_from_behind(observation, sooner_m).lidar
     echo = np.where(held.edge_side > 0, share, 0.0)
     behind = np.where(held.edge_side > 0, 2.0, np.inf)
-    return replace(observation, lidar=replace(held, edge_behind_m=behind, edge_echo=echo))
+    return replace(observation, surface=replace(held, edge_behind_m=behind, edge_echo=echo))
 
 
 def hold_from_behind(observation, sooner_m):
@@ -247,4 +247,4 @@ def hold_from_behind(observation, sooner_m):
     turn = is_left * np.sqrt(2) * sooner_m / np.linalg.norm(lidar.edge_points, axis=1)
     ends = turn_about_z(lidar.edge_points, -turn)
     behind = np.where(is_left, 0.2, np.inf)
-    return replace(observation, lidar=replace(lidar, edge_points=ends, edge_behind_m=behind))
+    return replace(observation, surface=replace(lidar, edge_points=ends, edge_behind_m=behind))

@@ -103,7 +103,7 @@ def test_join_differing_scan_is_refused(runs):
     own, _ = runs[0]
     seen = dict(own[RIGHT].observations)
     lidar = seen["000002"].lidar
-    seen["000002"] = replace(seen["000002"], lidar=replace(lidar, points=lidar.points + 0.001))
+    seen["000002"] = replace(seen["000002"], surface=replace(lidar, points=lidar.points + 0.001))
     together = join({**own, RIGHT: replace(own[RIGHT], observations=seen)})
     for estimate in together.estimates.values():
         assert "000002" not in estimate.used

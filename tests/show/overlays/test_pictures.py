@@ -40,7 +40,7 @@ def grey(camera):
 
 def image_board(camera):
     corners, _ = camera.project(transform(T_CAM_BOARD, BOARD.corners()))
-    return ImageBoard(corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, 0.1, 0.07)
+    return ImageBoard(T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, corners, 0.1, 0.07)
 
 
 def lidar_board(points):
