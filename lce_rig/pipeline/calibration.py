@@ -550,7 +550,12 @@ def _judged(
     """Judge the extrinsics of index k and assemble their result."""
     own, estimate, validation = solved[k], solved[k].estimate, solved[k].validation
     mine = [link for link in links if k in link.members]
-    others = [*estimate.association, *(finding for link in mine for finding in link.exchanged)]
+    exchanged = [finding for link in mine for finding in link.exchanged]
+    if not exchanged:
+        # Cameras are exchanged in their pairs with every LiDAR.
+        of_camera = [link for link in links if own.camera in link.sensors(solved)]
+        exchanged = [finding for link in of_camera for finding in link.exchanged][:1]
+    others = [*estimate.association, *exchanged]
     others += [finding for link in mine if k in _suspects(solved, link) for finding in link.contradictions]
     others += [finding for loop, finding in loops if (own.camera, own.lidar) in loop.pairs]
     # Exchanged LiDARs exchange their cameras' extrinsics, too.
