@@ -21,7 +21,7 @@ from lce_rig.calibrate import (
     EstimateSettings,
     estimate_extrinsics,
 )
-from lce_rig.calibrate.findings import UNDETERMINED
+from lce_rig.calibrate.findings import FEW_AGREE, UNDETERMINED
 from lce_rig.calibrate.options import Tolerances
 from lce_rig.calibrate.result import error_to_reference, squares_scale
 from lce_rig.calibrate.rig_estimate import RigResult, SensorPair, estimate_rig
@@ -57,6 +57,7 @@ from lce_rig.pipeline.findings import (
     CHANNEL_REJECTED,
     FEW_DETECTED,
     LIDAR_ABSENT,
+    SENSOR_DISAGREES,
     SHORTAGE,
     UNCONNECTED,
     absent_channels,
@@ -246,13 +247,16 @@ def calibrate_detections(
             alone.append(replace(pair, lacking=(*pair.lacking, *notes)))
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
-            sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
+            sensors = pairs[0].camera, pairs[0].lidar
+            shortage = replace(shortage, figures={**shortage.figures, "sensors": sensors})
             if shortage.code in (FEW_DETECTED.code, UNDETERMINED.code):
                 held = boards_in(detections, pairs[0].camera, pairs[0].lidar)
                 for plan in plan_captures(rig, pairs[0].camera, pairs[0].lidar, held):
                     where = tuple(plan.figures[key] for key in ("n_captures", "is_enough", "placements"))
                     shortage = replace(shortage, figures={**shortage.figures, "where": where})
-            shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
+            shortages.append(
+                shortage if shortage.subject else replace(shortage, subject=" and ".join(sensors))
+            )
     between: list[SolvedPeers] = []
     if cameras is None and channels is None:
         # A camera has one lens: that of its pair with the most captures.
@@ -291,8 +295,22 @@ def calibrate_detections(
         others += [finding for names, finding in named if names == own.names]
         calibrations.append(judged_peers(rig, own, others))
     if cameras is None and channels is None:
-        shortages += _unconnected(rig, detections, calibrations)
+        shortages = [*_without_disagreeing(shortages), *_unconnected(rig, detections, calibrations)]
     return calibrations, shortages
+
+
+def _without_disagreeing(shortages: Sequence[Finding]) -> list[Finding]:
+    """Name a sensor whose captures agree with those of no other one, in place of its pairs."""
+    sensors = [each.figures.get("sensors") for each in shortages if each.code == FEW_AGREE.code]
+    pairs = [{str(name) for name in pair} for pair in sensors if isinstance(pair, tuple)]
+    counts = Counter(name for pair in pairs for name in pair)
+    odd = [name for name, n in counts.most_common(1) if n == len(pairs) > 1]
+    if not odd:
+        return list(shortages)
+    (name,) = odd
+    others = ", ".join(sorted(set().union(*pairs) - {name}))
+    kept = [each for each in shortages if each.code != FEW_AGREE.code]
+    return [SENSOR_DISAGREES(name, others=others), *kept]
 
 
 def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:

@@ -54,6 +54,11 @@ LIDAR_ABSENT = warning_kind(
     "no capture holds a scan of {subject}",
     "record it with the others, or remove it from the profile",
 )
+SENSOR_DISAGREES = warning_kind(
+    "shortage.sensor_disagrees",
+    "captures of {subject} agree with no other sensor's ({others})",
+    "check its clock and topic: its samples may be of other times, or of another board",
+)
 CHANNEL_ABSENT = warning_kind(
     "shortage.channel_absent",
     "no capture holds {subject}: the result is without it",

@@ -113,7 +113,8 @@ def solve_peers(
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             # A camera with few scans of a LiDAR lacks those: that is reported with the LiDAR.
             if pair in detections.peers(rig.lidars):
-                shortages.append(replace(shortage, subject=str(pair)))
+                figures = {**shortage.figures, "sensors": (pair.camera, pair.lidar)}
+                shortages.append(replace(shortage, subject=str(pair), figures=figures))
     return solved, shortages
 
 

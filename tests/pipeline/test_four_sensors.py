@@ -79,6 +79,19 @@ def test_sensor_that_moved_is_named_where_a_pair_saw_little_of_it():
     assert verdicts == {"rear": ["pass", "fail", "fail"], "others": ["pass", "pass"]}
 
 
+def test_sensor_on_another_clock_is_named_once():
+    """Scans of `rear` are those of the next capture."""
+    found = simulate(N, 3)
+    names = sorted(found.lidars["rear"])
+    late = {
+        name: found.lidars["rear"][other] for name, other in zip(names, names[1:] + names[:1], strict=True)
+    }
+    results, shortages = calibrate_detections(RIG, Detections(found.images, {**found.lidars, "rear": late}))
+    assert {c.camera: c.verdict for c in results} == {"left": "pass", "right": "pass"}
+    (shortage,) = shortages
+    assert shortage.text == "captures of rear agree with no other sensor's (front, left, right)"
+
+
 @pytest.mark.slow
 def test_four_sensors_claims_cover_errors_of_many_sessions():
     """50 sessions of 30 placements, each seen by two or three of four sensors; profiles err as they state."""
