@@ -143,11 +143,12 @@ def find_moved_sensor(pairs: Sequence[PairCosts]) -> MovedSensor | None:
     shown = [pair for pair in pairs if pair.moved is not None]
     if len(pairs) < 2 or not shown:
         return None
-    names = sorted({name for pair in shown for name in pair.sensors})
+    names = sorted(set.intersection(*(set(pair.sensors) for pair in shown)))
     motions = [min(_motions(name, pairs), key=lambda each: each.log10_chance) for name in names]
-    best, next_best = sorted(motions, key=lambda each: each.log10_chance)[:2]
-    explains_all = all(best.name in pair.sensors for pair in shown)
-    return best if explains_all and best.log10_chance < next_best.log10_chance - _LEAD else None
+    ranked = sorted(motions, key=lambda each: each.log10_chance)
+    # At most two sensors are part of all pairs that show a motion.
+    next_chance = ranked[1].log10_chance if len(ranked) > 1 else 0.0
+    return ranked[0] if ranked and ranked[0].log10_chance < next_chance - _LEAD else None
 
 
 def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
