@@ -93,6 +93,7 @@ def test_each_mistake_is_named_with_its_line_and_key(old, new, key):
         ([("fx_px: 897.4566", "fx: 897.4566")], ["fx_px"]),
         ([("cx_px: 635.4040", "cx_pix: 635")], ["cx_px"]),
         ([("board:", "target_sigma_m: 0.02\nboard:")], ["calibration"]),
+        ([("width_m: 0.767", "width_m: 76.7")], ["5 m; 76.7 given", "write metres"]),
         # A pattern larger than the plate; sides swapped; squares counted for inner corners.
         ([("width_m: 0.767", "width_m: 0.3")], ["9x7", "70 mm", "0.63 x 0.49 m", "0.3 x 0.626 m"]),
         (
