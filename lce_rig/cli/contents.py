@@ -268,11 +268,11 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
             show.print_parts(_agreement(comparison, str(sessions[0])))
     if explain and not as_json:
         show.print_figures(document)
-    if compared.failed:
-        raise ResultRefusedError(
-            "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
-        )
     refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
+    if compared.failed:
+        opinion = "disagree, and" if refused else "agree, but"
+        causes = "; ".join(finding.text for finding in compared.failed)
+        raise ResultRefusedError(f"the extrinsics {opinion} {causes}", compared.failed[0].advice)
     if refused:
         names_of = ", ".join(f"{c.camera} and {c.lidar}" for c in refused)
         raise ResultRefusedError(f"the sessions disagree on the extrinsics of {names_of}")
