@@ -5,7 +5,7 @@
     rig = lce.load_rig("rlfs")
     session = lce.collect_from(rig, "recording.bag", "session/")
     result = lce.calibrate_session(session)          # .pairs[0].T_cam_lidar, .cov, .verdict, .findings
-    result.write()                                   # what `lce-rig calibrate` writes
+    result.write()                                   # the files of `lce-rig calibrate`
     lce.verify(session, result).write("overlays/")
 
 docs/python-api.md lists every public name. Each is imported when it is first used.

@@ -148,8 +148,8 @@ def collect(
 ) -> None:
     """Build or continue SESSION (default: session/), live or from recordings.
 
-    Without --from, read the attached sensors (check them with `lce-rig doctor`) and guide the person who
-    holds the board. Captures are taken automatically when the board stands still, or moves slowly before an
+    Without --from, read the attached sensors (check them with `lce-rig doctor`) and guide the person
+    with the board. Captures are taken automatically when the board stands still, or moves slowly before an
     event camera, until the profile's target is predicted to be met. Without a terminal it also ends after 30
     minutes without a capture, with --simulated after 10.
 

@@ -1,4 +1,4 @@
-"""`lce-rig captures`, `results` and `repeat`: what sessions hold, and whether their results agree."""
+"""`lce-rig captures`, `results` and `repeat`: captures and results of sessions, and their agreement."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -188,7 +188,7 @@ def results(session: Path, as_json: bool) -> None:
 
 
 def _pair(c: Calibration) -> dict[str, Any]:
-    """List the figures by which results are told apart."""
+    """List the figures that distinguish results."""
     px = c.metrics.reprojection_px
     return {
         "camera": c.camera,

@@ -139,13 +139,13 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What a method and the checks on its result say; NaN where they say nothing.
+    """Figures of a method and of the checks on its result; NaN for missing ones.
 
     result.json keeps each under its name here.
     """
 
     n_placements: float = math.nan  # different placements of the board among the captures used
-    held_out_m: float = math.nan  # mean over captures of their rms residual where they were not fitted
+    held_out_m: float = math.nan  # mean over held-out captures of their rms residual
     # Of Algorithm 1's residuals, rms over captures.
     fit_plane_rms_m: float = math.nan
     fit_edge_rms_m: float = math.nan
@@ -154,7 +154,7 @@ class Diagnostics:
     sigma_scatter_translation_m: float = math.nan
     sigma_systematic_rotation_deg: float = math.nan
     sigma_systematic_translation_m: float = math.nan
-    edge_shift_m: float = math.nan  # by how much ring ends lie beyond the board's edges
+    edge_shift_m: float = math.nan  # distance of ring ends beyond the board's edges
     edge_shift_sigma_m: float = math.nan
     # Additions to that by the background behind the board.
     edge_shift_echo_m: float = math.nan
@@ -289,7 +289,7 @@ class SceneOpinion:
     Attributes:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
         n_edges: of the scans, in or near their images.
-        state: whether the edges contradict the extrinsics, or cannot tell.
+        state: whether the edges agree with the extrinsics or contradict them; unknown if undetermined.
         change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
         cov: (6, 6) of the change, that of the extrinsics included.
     """
@@ -472,13 +472,13 @@ _Time = Annotated[
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; a field is empty where it is not known.
+    """Origin of a result; unknown fields are empty.
 
     Attributes:
         robot: its name, by the profile or `--robot`.
-        serials: serial numbers by sensor, as the devices told when captures were taken, else the profile's.
-        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted; None
-            where the recording tells no time.
+        serials: serial numbers by sensor, reported by the devices during the collection, else the profile's.
+        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
+            without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
         imported: when the last capture came into the session, in the same form; only where `date` is None.
     """
@@ -491,7 +491,7 @@ class Provenance:
 
     @property
     def date_words(self) -> str:
-        """The date, or "unknown, imported on 2026-11-23" where the recording tells none; "" for neither."""
+        """The date, or "unknown, imported on 2026-11-23" for a recording without times; "" for neither."""
         return self.date or (f"unknown, imported on {self.imported[:10]}" if self.imported else "")
 
 

@@ -24,17 +24,17 @@ in units of D has the density of `likelihood.end_density`. A beam that meets boa
 stronger echo: with q the share of the power that would come from the background if the beam met both alike,
 and r the range,
 
-    d = d_0 + c r + d_1 q    where the background is far behind
-    d = d_0 + c r + d_2 + d_3 q    where it is so near that both echoes blend into one                   (3)
+    d = d_0 + c r + d_1 q          background far behind
+    d = d_0 + c r + d_2 + d_3 q    background so near that both echoes blend into one                    (3)
 
 Recordings show d_1 near -17 mm, simulation -15 mm. A plate that is larger than its drawing shifts all edges
 alike by half as much; width and height have an unknown each.
-What is left, the same for all ring ends (a beam that is not symmetric, a clock of the rotor), is a small
+The remainder, common to all ring ends (an asymmetric beam, a clock of the rotor), is a small
 displacement of ring ends against the returns between them, along azimuth and upwards. Without rings, beams
-may be ten times as wide one way as the other: what half a beam's width adds along each edge's normal is
-subtracted by the search, in two parts for its two axes, and a relative error of each is unknown.
+may be ten times as wide one way as the other: the search subtracts half a beam's width along each edge's
+normal, in two parts for its two axes, and a relative error of each is unknown.
 
-Lens. A spinning LiDAR sends its beams from a lens beside its axis, and drivers that do not know where place
+Lens. A spinning LiDAR sends its beams from a lens beside its axis, and drivers without its position place
 points as if they came from the axis. With e_a the direction of growing azimuth and alpha the elevation, a
 point lies at
 
@@ -78,7 +78,7 @@ from lce_rig.core.results import LidarBoard, PatternBoard
 
 # Typical noise of a cell's mean without rings.
 _MEAN_M = 0.008
-# Half a beam's width, and what the outline found in the scan may be off by.
+# Half a beam's width plus the error of the outline in the scan, m.
 _BORDER_M = 0.02
 # A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
 _SHORTEST_STEP_M = 2e-4
@@ -101,7 +101,7 @@ class StackedScans:
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 6) as `fields`.
-        end_background: (M, 3) what is behind it, `describe_background`.
+        end_background: (M, 3) the background, `describe_background`.
         end_beam: (M, 2) half the beam's width along the edge's normal, by the beam's two axes; 0 with rings.
         end_sigma: (M,) noise beyond that of a sharp border, m; 0 for a sharp one.
     """
@@ -137,7 +137,7 @@ class StackedScans:
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
     """Remove returns near the border, where the beam also hits the background and reads too long.
 
-    Corners that another camera sees are no returns: `images` weighs them.
+    Corners in another camera's image are not returns: `images` weighs them.
     """
     if isinstance(lidar, PatternBoard):
         return replace(lidar, points=lidar.points[:0], ring=lidar.ring[:0])
@@ -153,7 +153,7 @@ def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
 def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     """Stack the boards of F captures; `board` is their size."""
     rings = np.unique(np.concatenate([numbers for b in boards for numbers in (b.ring, b.edge_ring)]))
-    # Where no LiDAR saw the boards, one ring stands for its errors, which nothing measures.
+    # Without a LiDAR, one ring stands for its unmeasured errors.
     rings = rings if len(rings) else np.array([NO_RING], dtype=np.int16)
     capture = np.repeat(np.arange(len(boards)), [len(board.points) for board in boards])
     ring = np.searchsorted(rings, np.concatenate([board.ring for board in boards]))
@@ -344,7 +344,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     turned = turn_rays(scans.end_rays)
     off = scans.end_fields @ state.fields
     off += range_m[:, None] * np.einsum("mij,jm->mi", turned, state.lasers[1:, scans.end_ring])
-    # A displaced point is where its displaced ray meets the plane.
+    # A displaced point is the intersection of its displaced ray with the plane.
     off -= (np.sum(n * off, axis=1) / cosine)[:, None] * scans.end_rays
     here = range_m[:, None] * scans.end_rays - t + off
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off
