@@ -1,8 +1,7 @@
 """The result of a calibration: `Calibration`, one camera and one LiDAR, and `ResultFile`, result.json.
 
 The fields of both are the keys of the file, in the order of the file. pydantic reads and writes them by their
-annotations; a record that the program makes is not checked again. A further figure is one further field with
-a default, so that files of earlier versions stay readable.
+annotations; a record that the program makes is not checked again. A further figure is one further field.
 """
 
 import json
@@ -60,14 +59,11 @@ def _covariance(rows: Any) -> Array:
 
 
 def _record(record: Any) -> Any:
-    """Name what the file holds of a finding like its fields; refusals of earlier versions have fewer."""
+    """Name a stored finding's keys like its fields."""
     if not isinstance(record, dict):
         return record
-    code, stage = record.get("code", ""), record.get("stage")
-    if stage is not None and not code.startswith(f"{stage}."):
-        code = f"{stage}.text"
     words = record.get("cause", record.get("text")), record.get("action")
-    return {"figures": {}, **record, "code": code, "action": record.get("action_code", ""), "stored": words}
+    return {**record, "action": record.get("action_code"), "stored": words}
 
 
 _LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
@@ -220,7 +216,7 @@ class Contribution:
 
     Attributes:
         source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
-            "focal_length" or "square_size", or "contradiction_" with the check that contradicts.
+            "intrinsics" or "square_size", or "contradiction_" with the check that contradicts.
         sigma_rotation_deg, sigma_translation_m: its contribution.
     """
 
@@ -334,7 +330,7 @@ class Calibration:
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
-            None in files of earlier versions, whose extrinsics belong to the profile's.
+            None for those of the profile.
         lidar_intrinsics: of a second camera, likewise; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
@@ -433,16 +429,8 @@ class Calibration:
 
 
 def _from_pair(pair: Any) -> Any:
-    """Read a pair of result.json, which holds the metrics side by side with the rest.
-
-    Files of earlier versions hold reasons in place of findings.
-    """
-    if not isinstance(pair, dict):
-        return pair
-    severity = "error" if pair.get("verdict") == "fail" else "warning"
-    reason = {"code": "verdict.text", "severity": severity, "subject": "", "figures": {}, "action_code": ""}
-    reasons = [{**reason, "text": text, "action": ""} for text in pair.get("reasons") or ()]
-    return {**pair, "metrics": pair, "findings": pair.get("findings") or reasons}
+    """Read a pair of result.json, which holds the metrics side by side with the rest."""
+    return {**pair, "metrics": pair} if isinstance(pair, dict) else pair
 
 
 def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, Any]]) -> dict[str, Any]:
@@ -463,11 +451,7 @@ def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, 
     return pair
 
 
-_Time = Annotated[
-    Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None,
-    # Earlier versions wrote "" for a time that is not known.
-    BeforeValidator(lambda time: time or None),
-]
+_Time = Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None
 
 
 @dataclass(frozen=True)
@@ -533,9 +517,9 @@ class ResultFile:
     Attributes:
         rig: its name.
         made_by: the program and its version.
-        provenance: robot, sensors and date; empty in files of earlier versions.
+        provenance: robot, sensors and date.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
-        on_base: the pose of each sensor; None for two sensors, and in files of earlier versions.
+        on_base: the pose of each sensor; None for two sensors.
         pairs: one for each camera and LiDAR.
     """
 

@@ -275,8 +275,7 @@ def _fit(
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step: a camera_info file for each camera.
 
-    Other files there stay, as those of cameras that an earlier run measured. Figures and plots that an
-    earlier version wrote of these cameras leave.
+    Other files there stay, as those of cameras that an earlier run measured.
 
     Returns:
         The files of this run.
@@ -286,10 +285,9 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
     """
     place = session.path / INTRINSICS
     names = {f"camera_info_{one.camera}.yaml": one for one in measured}
-    of_earlier = {"intrinsics.json", *(f"{one.camera}.png" for one in measured)}
 
     def finish(earlier: Path, draft: Path) -> None:
-        keep_foreign(earlier, draft, lambda path: path.name in of_earlier)
+        keep_foreign(earlier, draft, lambda _path: False)
 
     with replacing(session.path, place, finish) as draft:
         for name, one in names.items():
