@@ -11,7 +11,6 @@
 docs/python-api.md lists every public name. Each is imported when it is first used.
 """
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -81,12 +80,6 @@ __all__ = [
     "write_exports",
 ]
 __version__ = "0.1.0"
-
-# OpenCV reads this once, when it is first loaded: images that declare more are refused before any memory is
-# taken.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
-# Damaged images are reported by lce-rig, once.
-os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _HOMES = {
     "lce_rig.calibrate": ("CalibrateOptions",),
