@@ -5,13 +5,12 @@
     rig = lce.load_rig("rlfs")
     session = lce.collect_from(rig, "recording.bag", "session/")
     result = lce.calibrate_session(session)          # .pairs[0].T_cam_lidar, .cov, .verdict, .findings
-    result.write()                                   # what `lce-rig calibrate` writes
+    result.write()                                   # the files of `lce-rig calibrate`
     lce.verify(session, result).write("overlays/")
 
 docs/python-api.md lists every public name. Each is imported when it is first used.
 """
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -81,12 +80,6 @@ __all__ = [
     "write_exports",
 ]
 __version__ = "0.1.0"
-
-# OpenCV reads this once, when it is first loaded: images that declare more are refused before any memory is
-# taken.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
-# Damaged images are reported by lce-rig, once.
-os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _HOMES = {
     "lce_rig.calibrate": ("CalibrateOptions",),

@@ -26,8 +26,7 @@ are stable; texts may change in any release.
 | `text`, `action` | the same in words, with the command to type |
 
 Refused captures have `stage` and `cause` in place of `severity` and `text`; the code begins with the stage:
-`read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`. Codes that end in `.text` come
-from results of earlier versions.
+`read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`.
 
 | command | prints with `--json` |
 |---|---|

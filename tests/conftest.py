@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from lce_rig.cli.entry import limit_opencv
 from lce_rig.rig import load_rig
 from tests.shared import Shared, find_folder
 
@@ -16,6 +17,9 @@ settings.register_profile(
     "lce-rig", deadline=None, derandomize=not _EXAMPLES, max_examples=int(_EXAMPLES or 50)
 )
 settings.load_profile("lce-rig")
+
+# Before OpenCV is loaded, so that tests read images as the command line does.
+limit_opencv()
 
 # What a shell runs in the background ignores Ctrl-C, and so would processes that tests start to press it for.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -1,7 +1,7 @@
 """Extrinsic calibration of one camera and one LiDAR from pairs of detected boards.
 
-`estimate` tells the method. Read `observations`, `consensus`, `motion/`, `algorithm_1/`, `likelihood/` and
-`uncertainty` in this order.
+`estimate` lists the method's steps. Read `observations`, `consensus`, `motion/`, `algorithm_1/`,
+`likelihood/` and `uncertainty` in this order.
 """
 
 from lce_rig.calibrate.estimate import estimate_extrinsics, fit_extrinsic

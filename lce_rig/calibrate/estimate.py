@@ -55,7 +55,7 @@ def estimate_extrinsics(
         board: its specification.
         settings: method, priors and tolerances.
         clocks: of the sensors.
-        progress: told of each step.
+        progress: called at each step.
 
     Raises:
         NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
@@ -148,7 +148,7 @@ def estimate_observations(
         observations: one per capture.
         board: its specification.
         settings: method, priors and tolerances.
-        progress: told of each step.
+        progress: called at each step.
 
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.

@@ -32,12 +32,12 @@ _ORDERS = {
 
 
 def _mirrored(finding: Finding) -> str:
-    """Images or scans are mirrored: {n_explained} of {n_captures} ({captures}), {n_agreeing} as they are."""
+    """Images or scans are mirrored: {n_explained} of {n_captures} ({captures}), {n_agreeing} unchanged."""
     some = bool(finding.figures["captures"])
     what = "images of {captures:few} are" if some else "images or scans are"
     return fill(
         what
-        + " mirrored: {n_explained} of {n_captures} captures agree when mirrored, {n_agreeing} as they are",
+        + " mirrored: {n_explained} of {n_captures} captures agree when mirrored, {n_agreeing} unchanged",
         finding.figures,
     )
 

@@ -30,14 +30,14 @@ _SIGNIFICANT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class LidarErrors:
-    """What sessions tell of a LiDAR.
+    """A LiDAR's constant errors from sessions.
 
     Attributes:
         found: its constant errors; a laser's deviations are about the mean of all lasers.
         prior_sigma: (3,) deviations of a laser's errors about their mean without these sessions.
         n_captures: by session.
         n_points: (K,) returns of each laser on boards.
-        offset_m: by how much all ranges are too long; None where the sessions do not show it significantly.
+        offset_m: constant error of all ranges, positive if too long; None if not significant.
             It is not part of the lasers' errors in `found`.
         offset_sigma_m: of it.
         has_lasers: whether the sessions determine the errors of single lasers, not only that offset.
@@ -53,7 +53,7 @@ class LidarErrors:
 
     @property
     def gain(self) -> Array:
-        """By what factor (3,) the sessions lower the median deviation of range, azimuth and elevation."""
+        """Ratio (3,) by which the sessions lower the median deviation of range, azimuth and elevation."""
         return np.asarray(self.prior_sigma / np.median(self.found.lasers_sigma, axis=1))
 
 
@@ -73,7 +73,7 @@ def estimate_lidar(
         sessions: observations of each; boards stood still.
         board: the board.
         T_cam_lidar: (4, 4) of each, as Algorithm 1 finds it.
-        options: priors of the LiDAR's range errors; what is known of it already is not used.
+        options: priors of the LiDAR's range errors; its known errors are not used.
         scale_sigma: relative standard deviation of the cameras' distances, against which a range offset is
             tested; that of the usual prior by default.
         subtracted_m: from all ranges already.

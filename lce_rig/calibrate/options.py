@@ -1,4 +1,4 @@
-"""Options of a calibration, and what a profile says of the LiDAR, the lens and the board."""
+"""Options of a calibration, and the profile's settings of the LiDAR, the lens and the board."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -38,7 +38,7 @@ class Tolerances:
 
     @classmethod
     def of(cls, camera: CameraSettings, board: BoardSettings) -> "Tolerances":
-        """Read a profile's camera and board; defaults take the place of what it leaves out."""
+        """Read a profile's camera and board; missing settings get defaults."""
         squares_m = _SQUARE * board.square_m if board.square_sigma_m is None else board.square_sigma_m
         return cls(
             lens=LensPrior.read(camera, board),
@@ -78,7 +78,7 @@ class KnownLidar:
     Attributes:
         rings: (K,) ring numbers.
         lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `likelihood.layout.LASER`.
-        lasers_sigma: (3, K) their standard deviations about what is common to all lasers.
+        lasers_sigma: (3, K) their standard deviations about the mean of all lasers.
         lens: (2,) lateral m and vertical m per rad displacement of the lens.
         lens_sigma: (2,) of it.
     """
@@ -119,7 +119,7 @@ class EstimateSettings(CalibrateOptions):
         has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
         tolerances: of the profile's lens and board; None takes both as exact.
-        lens: of the session; None to fit it first where there are tolerances.
+        lens: of the session; None to fit it first, with tolerances.
     """
 
     laser_bias_sigma_m: float = 0.0
@@ -133,7 +133,7 @@ class EstimateSettings(CalibrateOptions):
     def of(
         cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None
     ) -> "EstimateSettings":
-        """Add what the profile says of a LiDAR, and of lens and board, to a user's options."""
+        """Add the profile's settings of a LiDAR, and of lens and board, to a user's options."""
         return cls(
             options.method,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,

@@ -209,8 +209,8 @@ def end_rows(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, Array, NDAr
 def describe_background(lidar: LidarBoard) -> Array:
     """Describe the background of each ring end (M, 3).
 
-    Columns are the background's share of the power where it is far behind, whether it blends, and its share
-    where it does. The share acts in proportion to the beam's width: without rings, it is multiplied by that.
+    Columns are the share of the power of a background far behind, whether it blends, and the share of one
+    that blends. The share acts in proportion to the beam's width: without rings, it is multiplied by that.
     """
     cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
     blends, echo = lidar.edge_behind_m < BLENDS_M * cosine, lidar.edge_echo

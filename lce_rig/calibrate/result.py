@@ -1,4 +1,4 @@
-"""What a calibration gives: extrinsics with uncertainty, certificate and residuals."""
+"""Result of a calibration: extrinsics with uncertainty, certificate and residuals."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,12 +18,12 @@ from lce_rig.core.results import ImageBoard, Observation
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """How far an error of the profile moves the extrinsics, as they are used with the result's intrinsics.
+    """Effect of an error of the profile on the extrinsics, used with the result's intrinsics.
 
-    Or the moves that would resolve what a check contradicts: the covariance holds both sides.
+    Or the moves that would resolve a check's contradiction: the covariance holds both sides.
 
     Attributes:
-        source: what is wrong, or the check.
+        source: the erroneous quantity, or the check.
         sigma: its standard deviation, in its own unit.
         moves: (n, 6) tangents (translation m, rotation rad) per unit, of n independent errors of that size.
     """
@@ -46,7 +46,7 @@ class Start:
         certificate: of Algorithm 1's final cost over all captures used.
         observations: the F captures used, as measured, sorted by name.
         refused: why each other capture is not used.
-        held_out_m: (F,) error of each capture where it was not fitted.
+        held_out_m: (F,) error of each capture in the fits without it.
         diagnostics: further figures.
     """
 
@@ -85,7 +85,7 @@ class CalibrationEstimate:
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: of the camera, with the time offset of each; empty if they were not separated.
-        channel_difference: of the extrinsics of two channels; None where they cannot be compared.
+        channel_difference: of the extrinsics of two channels; None if they cannot be compared.
         association: errors by which images and scans of some captures do not belong together.
     """
 

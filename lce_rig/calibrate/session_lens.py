@@ -1,4 +1,4 @@
-"""The session's lens: the profile's intrinsics and the boards in the images, weighed by what they are worth.
+"""The session's lens: the profile's intrinsics and the boards in the images, weighed by their information.
 
 The LiDAR has no part in it. Its constant errors, a turn about the vertical of 0.1 to 0.2 deg in recordings,
 look like a shift of the principal point, and would move a lens that it may move. Lens and shape of the board
@@ -8,7 +8,7 @@ the extrinsics are estimated with these poses. The covariance of lens and board 
     cov = cov_T|K + J cov_K J^T,    cov_K' = J cov_K,    J = dT / dK + W                                   (1)
 
 Extrinsics and intrinsics of a result are used together. An error of the intrinsics that projects like a
-rotation W of the camera turns the extrinsics back by nearly as much, and what is left counts: W is in J.
+rotation W of the camera turns the extrinsics back by nearly as much; W in J keeps the difference.
 """
 
 from collections.abc import Mapping, Sequence

@@ -167,7 +167,7 @@ def _sensitivities(
     boards = [observation.image for observation in start.fitted]
     images = stack_images(np.arange(len(boards)), boards, board.pattern_offset_m, lens)
     by_error = _moves_by_poses(start, np.moveaxis(images.errors, -1, 0))
-    # The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
+    # The extrinsics are used with the intrinsics of the same result: the joint effect of both errors counts.
     by_lens = by_error[3:] + np.pad(images.turns.T, ((0, 0), (3, 0)))
     moves: dict[Source, Array] = {"square_size": by_error[:1], "pattern_offset": by_error[1:3]}
     if lens is not None:
@@ -212,7 +212,7 @@ def by_likelihood(
         start: Algorithm 1's solution.
         joint: of F captures.
         board: its specification.
-        lens: of the camera; None where it is exact.
+        lens: of the camera; None if exact.
         camera: its number.
     """
     moves = joint.cost.moves() @ joint.to_extrinsics[camera].T

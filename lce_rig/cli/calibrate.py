@@ -287,7 +287,7 @@ def _calibrate_scene(
 
 
 def collect_command(session: lce.Session) -> str:
-    """Write the command that adds captures to a session, from where its own come from."""
+    """Write the command that adds captures to a session, with the source of its present ones."""
     from lce_rig.cli.simulate import TRUTH
 
     options = " --from RECORDING"
@@ -388,13 +388,13 @@ def _rig_parts(
 def _parts(
     c: Calibration, path: str, told: dict[str, str], *, is_explained: bool, is_of_rig: bool
 ) -> Iterator[Any]:
-    """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested.
+    """Print the verdict, its reasons, the extrinsics and their uncertainty; explained, every test.
 
     Args:
         c: the result of a pair.
         path: of the session.
-        told: reasons of earlier pairs, and the pair; those of this one are added.
-        is_explained: whether to tell everything.
+        told: pair by printed reason; this pair's reasons are added.
+        is_explained: whether to print every figure.
         is_of_rig: whether a list of all sensors follows, which has the poses.
     """
     colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"

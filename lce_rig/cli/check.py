@@ -85,7 +85,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
 def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[Finding]:
     """Compare the plate's size in all scans of a pair, and the boards' distances, with the profile.
 
-    Images and scans that do not belong together are named before, and alone where they concern all captures.
+    Unmatched images and scans come first, and alone if they concern all captures.
     """
     from lce_rig.judge.verdict import distance_findings, plate_findings
 
@@ -196,7 +196,7 @@ def _causes(
     Args:
         names: of all captures.
         refused: by name.
-        plates: what is wrong with the plate's size in all scans.
+        plates: findings about the plate's size in all scans.
         session: path, for the commands of actions.
         is_whole: whether to list every capture with its figures.
     """

@@ -1,6 +1,8 @@
 """`lce-rig collect`: build a session from attached sensors (guided) or from recordings."""
 
+import re
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from lce_rig.io.recording import SourceOptions
 from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
+from lce_rig.show.phone.preview import DEFAULT_PORT, LOOPBACK
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -35,7 +38,24 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     return topics
 
 
-@click.command()
+# --preview's address where another word follows it: this computer alone.
+_PREVIEW_DEFAULT = f"{LOOPBACK}:{DEFAULT_PORT}"
+_PREVIEW_ADDRESS = re.compile(r"[^/\s]*:\d*|\d+|\d+(\.\d+){3}|localhost")
+
+
+class _Command(click.Command):
+    """`--preview session/` is the option without an address, and the session."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Give --preview its default address if no address follows it."""
+        args = list(args)
+        for k, (word, following) in enumerate(pairwise(args)):
+            if word == "--preview" and not _PREVIEW_ADDRESS.fullmatch(following):
+                args[k] = f"--preview={_PREVIEW_DEFAULT}"
+        return super().parse_args(ctx, args)
+
+
+@click.command(cls=_Command)
 @click.option(
     "--rig",
     "rig_name",
@@ -107,9 +127,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option(
     "--preview",
     is_flag=False,
-    flag_value="127.0.0.1:8765",
+    flag_value=_PREVIEW_DEFAULT,
     metavar="[HOST:PORT]",
-    help="Live: serve a page for a phone [default address: 127.0.0.1:8765]. Its link has a token.",
+    help=f"Live: serve a page for a phone [default address: {_PREVIEW_DEFAULT}]. Its link has a token.",
 )
 @path_option("--record", "FOLDER", "Live: also record the raw streams into a new folder, which --from reads.")
 @click.option("--simulated", is_flag=True, help="Live: collect from a simulated rig with a simulated person.")
@@ -128,8 +148,8 @@ def collect(
 ) -> None:
     """Build or continue SESSION (default: session/), live or from recordings.
 
-    Without --from, read the attached sensors (check them with `lce-rig doctor`) and guide the person who
-    holds the board. Captures are taken automatically when the board stands still, or moves slowly before an
+    Without --from, read the attached sensors (check them with `lce-rig doctor`) and guide the person
+    with the board. Captures are taken automatically when the board stands still, or moves slowly before an
     event camera, until the profile's target is predicted to be met. Without a terminal it also ends after 30
     minutes without a capture, with --simulated after 10.
 

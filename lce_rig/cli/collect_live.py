@@ -164,7 +164,7 @@ def _tell(
     Raises:
         SourceError: a sensor was lost permanently; the captures are kept.
         LceRigError: the recording ended early, for example on a full disk; the captures are kept.
-        NotEnoughDataError: there is no capture, or too few when the new placements are exhausted.
+        NotEnoughDataError: there are no captures, or too few when the new placements are exhausted.
     """
     for text in report.notes:
         show.note(text)
@@ -217,7 +217,7 @@ def _more(path: Path) -> str:
 
 
 def is_met(prediction: Finding) -> bool:
-    """Tell whether the predicted standard deviations are within the profile's target.
+    """Check whether the predicted standard deviations are within the profile's target.
 
     The guide itself ends a collection later, when they are within it with a margin.
     """

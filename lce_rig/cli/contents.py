@@ -1,4 +1,4 @@
-"""`lce-rig captures`, `results` and `repeat`: what sessions hold, and whether their results agree."""
+"""`lce-rig captures`, `results` and `repeat`: captures and results of sessions, and their agreement."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -188,7 +188,7 @@ def results(session: Path, as_json: bool) -> None:
 
 
 def _pair(c: Calibration) -> dict[str, Any]:
-    """List the figures by which results are told apart."""
+    """List the figures that distinguish results."""
     px = c.metrics.reprojection_px
     return {
         "camera": c.camera,
@@ -268,11 +268,11 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
             show.print_parts(_agreement(comparison, str(sessions[0])))
     if explain and not as_json:
         show.print_figures(document)
-    if compared.failed:
-        raise ResultRefusedError(
-            "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
-        )
     refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
+    if compared.failed:
+        opinion = "disagree, and" if refused else "agree, but"
+        causes = "; ".join(finding.text for finding in compared.failed)
+        raise ResultRefusedError(f"the extrinsics {opinion} {causes}", compared.failed[0].advice)
     if refused:
         names_of = ", ".join(f"{c.camera} and {c.lidar}" for c in refused)
         raise ResultRefusedError(f"the sessions disagree on the extrinsics of {names_of}")

@@ -1,4 +1,4 @@
-"""`lce-rig deploy`: put a result on a robot, ask what is there, or go back."""
+"""`lce-rig deploy`: put a result on a robot, show the deployed one, or go back."""
 
 import shlex
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def deploy(
 
     Refused with exit code 7: a failed result, another rig, another robot's name or serial numbers, captures
     older than those deployed, MARGINAL in place of PASS, and sensors that move by more than the tolerance of
-    the profile's nominal extrinsics (5 deg, 100 mm where it has none). Exits with 8 if the target was not
+    the profile's nominal extrinsics (default: 5 deg, 100 mm). Exits with 8 if the target was not
     reached or written and holds the earlier set, and with 9 if the command after it failed and the new set
     is in place.
     """

@@ -1,4 +1,4 @@
-"""`lce-rig drift`: compare deployed extrinsics with the edges of a scene, exit by what they say."""
+"""`lce-rig drift`: compare deployed extrinsics with the edges of a scene; the exit code is the outcome."""
 
 import time
 from collections.abc import Iterator
@@ -55,8 +55,8 @@ def drift(
 
     RECORDING is a session or, with --rig, a folder of images and point clouds, a bag, an mcap, or several
     simultaneous recordings. With --rig and no RECORDING, the attached sensors are watched until Ctrl-C. Edges
-    of the scans are compared with edges of the images, and with the board where it is in view.
-    Exits with 0 if the extrinsics hold, with 7 if they changed, and with 6 if neither opinion can tell.
+    of the scans are compared with edges of the images, and with the board if it is in view.
+    Exits with 0 if the extrinsics hold, with 7 if they changed, and with 6 if scene and board leave it open.
     """
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:
@@ -95,7 +95,7 @@ def drift(
             raise error(f"{STATES[state]}: {names}", as_line(concerned[0].advice) if as_json else "")
 
 
-# What was seen is judged after Ctrl-C; a second one ends that too.
+# Time limit of the judgement after Ctrl-C, s; a second Ctrl-C ends it.
 _JUDGING_S = 120.0
 
 
@@ -136,6 +136,6 @@ def _parts(pair: PairDrift) -> Iterator[Any]:
 
 
 def _of_boards(board: BoardDrift) -> str:
-    """Return the first finding of the boards; what they hide if there is no other."""
+    """Return the boards' first finding; their blind directions come last."""
     opinion = f"{show.counted(board.n_boards, 'board')}: {STATES[board.state]}"
     return f"{opinion}; {board.findings[0].text}"

@@ -19,6 +19,7 @@ def main() -> None:
     try:
         watch_for_interrupts()
         limit_memory()
+        limit_opencv()
         # Its matrices are small: threads of BLAS would only wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from lce_rig.cli.main import run
@@ -50,6 +51,16 @@ def limit_memory() -> None:
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         limit = max(int(_SHARE_OF_MEMORY * total_bytes), _LEAST_BYTES)
         resource.setrlimit(resource.RLIMIT_DATA, (limit if hard < 0 else min(limit, hard), hard))
+
+
+def limit_opencv() -> None:
+    """Limit OpenCV's images, and silence its log, in this process and those that it starts.
+
+    OpenCV reads these variables when it is first loaded. It refuses images that declare more pixels before it
+    takes any memory; damaged images are reported by lce-rig, once.
+    """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
 def _open_closed_streams() -> None:

@@ -74,7 +74,7 @@ def export(
     """Write the result of SESSION (default: session/) for other programs.
 
     `calibrate` has written the usual formats already. With --tree or --into, the sensor nearest to the root
-    of the robot's tree stays where it is; the poses of the others change, and missing ones are added.
+    of the robot's tree keeps its pose; the poses of the others change, and missing ones are added.
     """
     if str(session) in EXPORTS and not session.exists():
         raise UsageError(

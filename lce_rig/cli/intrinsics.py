@@ -152,7 +152,7 @@ def lidar_intrinsics(
     """Estimate the constant errors of a LiDAR from the boards of one or several SESSIONs.
 
     These are range, azimuth and elevation of each laser, the displacement of the beams' origin, and an
-    offset of all ranges where it is significant (range_offset_m). Boards must have stood still. `calibrate`
+    offset of all ranges if significant (range_offset_m). Boards must have stood still. `calibrate`
     starts from the errors in the profile that --save-profile writes. Exits with 6 for too few captures, with
     7 if boards moved or captures do not determine the lasers' ranges.
     """

@@ -24,7 +24,7 @@ STAMPS = "stamps.csv"
 _MAX_IMAGES = 1_000_000
 # Enough for the network to settle before the first requested image.
 _WARM_UP_NS = 1_500_000_000
-# In so much of a recording lamps show whether they flicker.
+# Start of the recording in which flicker of lamps is measured.
 _FIRST_NS = 1_000_000_000
 
 

@@ -258,7 +258,7 @@ def board(
     cols, rows = map(int, counts.groups())
     more: dict[str, object] = {}
     if kind == "charuco":
-        # Name the smallest dictionary of a family that has so many markers, or its largest.
+        # Pick the family's smallest dictionary with at least n markers, else its largest.
         family = "5X5"
         n_markers = cols * rows // 2
         names = [name for name in DICTIONARIES if name.startswith(f"{family}_")]

@@ -103,12 +103,12 @@ def warn_of(findings: Iterable[Finding]) -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print a result for machines: findings, records and arrays as they are, too."""
+    """Print a result as JSON; findings, records and arrays are converted."""
     click.echo(_as_json(document))
 
 
 def print_figures(document: Any) -> None:
-    """Print every figure of what `print_json` prints, for people: as YAML, to five digits."""
+    """Print every figure of `print_json` as YAML, to five digits."""
     rounded = json.loads(_as_json(document), parse_float=lambda text: float(f"{float(text):.5g}"))
     click.echo(yaml.safe_dump(rounded, sort_keys=False, default_flow_style=None, width=100), nl=False)
 

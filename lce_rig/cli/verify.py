@@ -115,7 +115,7 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
     With wrong extrinsics, edges of things have the colours of their background. Points that no camera sees
     are grey. Drag to turn, scroll to zoom; N and P change to the next and the previous capture.
 
-    Exits with 5 where there is no display, or Open3D cannot open a window.
+    Exits with 5 without a display, or if Open3D cannot open a window.
     """
     opened = with_profile_of(lce.Session.open(session), name)
     pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs

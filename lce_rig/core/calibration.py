@@ -1,8 +1,7 @@
 """The result of a calibration: `Calibration`, one camera and one LiDAR, and `ResultFile`, result.json.
 
 The fields of both are the keys of the file, in the order of the file. pydantic reads and writes them by their
-annotations; a record that the program makes is not checked again. A further figure is one further field with
-a default, so that files of earlier versions stay readable.
+annotations; a record that the program makes is not checked again. A further figure is one further field.
 """
 
 import json
@@ -60,14 +59,11 @@ def _covariance(rows: Any) -> Array:
 
 
 def _record(record: Any) -> Any:
-    """Name what the file holds of a finding like its fields; refusals of earlier versions have fewer."""
+    """Name a stored finding's keys like its fields."""
     if not isinstance(record, dict):
         return record
-    code, stage = record.get("code", ""), record.get("stage")
-    if stage is not None and not code.startswith(f"{stage}."):
-        code = f"{stage}.text"
     words = record.get("cause", record.get("text")), record.get("action")
-    return {"figures": {}, **record, "code": code, "action": record.get("action_code", ""), "stored": words}
+    return {**record, "action": record.get("action_code"), "stored": words}
 
 
 _LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
@@ -139,13 +135,13 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What a method and the checks on its result say; NaN where they say nothing.
+    """Figures of a method and of the checks on its result; NaN for missing ones.
 
     result.json keeps each under its name here.
     """
 
     n_placements: float = math.nan  # different placements of the board among the captures used
-    held_out_m: float = math.nan  # mean over captures of their rms residual where they were not fitted
+    held_out_m: float = math.nan  # mean over held-out captures of their rms residual
     # Of Algorithm 1's residuals, rms over captures.
     fit_plane_rms_m: float = math.nan
     fit_edge_rms_m: float = math.nan
@@ -154,7 +150,7 @@ class Diagnostics:
     sigma_scatter_translation_m: float = math.nan
     sigma_systematic_rotation_deg: float = math.nan
     sigma_systematic_translation_m: float = math.nan
-    edge_shift_m: float = math.nan  # by how much ring ends lie beyond the board's edges
+    edge_shift_m: float = math.nan  # distance of ring ends beyond the board's edges
     edge_shift_sigma_m: float = math.nan
     # Additions to that by the background behind the board.
     edge_shift_echo_m: float = math.nan
@@ -221,7 +217,7 @@ class Contribution:
 
     Attributes:
         source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
-            "focal_length" or "square_size", or "contradiction_" with the check that contradicts.
+            "intrinsics" or "square_size", or "contradiction_" with the check that contradicts.
         sigma_rotation_deg, sigma_translation_m: its contribution.
     """
 
@@ -290,7 +286,7 @@ class SceneOpinion:
     Attributes:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
         n_edges: of the scans, in or near their images.
-        state: whether the edges contradict the extrinsics, or cannot tell.
+        state: whether the edges agree with the extrinsics or contradict them; unknown if undetermined.
         change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
         cov: (6, 6) of the change, that of the extrinsics included.
     """
@@ -335,7 +331,7 @@ class Calibration:
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
-            None in files of earlier versions, whose extrinsics belong to the profile's.
+            None for those of the profile.
         lidar_intrinsics: of a second camera, likewise; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
@@ -434,16 +430,8 @@ class Calibration:
 
 
 def _from_pair(pair: Any) -> Any:
-    """Read a pair of result.json, which holds the metrics side by side with the rest.
-
-    Files of earlier versions hold reasons in place of findings.
-    """
-    if not isinstance(pair, dict):
-        return pair
-    severity = "error" if pair.get("verdict") == "fail" else "warning"
-    reason = {"code": "verdict.text", "severity": severity, "subject": "", "figures": {}, "action_code": ""}
-    reasons = [{**reason, "text": text, "action": ""} for text in pair.get("reasons") or ()]
-    return {**pair, "metrics": pair, "findings": pair.get("findings") or reasons}
+    """Read a pair of result.json, which holds the metrics side by side with the rest."""
+    return {**pair, "metrics": pair} if isinstance(pair, dict) else pair
 
 
 def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, Any]]) -> dict[str, Any]:
@@ -464,22 +452,18 @@ def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, 
     return pair
 
 
-_Time = Annotated[
-    Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None,
-    # Earlier versions wrote "" for a time that is not known.
-    BeforeValidator(lambda time: time or None),
-]
+_Time = Annotated[str, Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")] | None
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; a field is empty where it is not known.
+    """Origin of a result; unknown fields are empty.
 
     Attributes:
         robot: its name, by the profile or `--robot`.
-        serials: serial numbers by sensor, as the devices told when captures were taken, else the profile's.
-        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted; None
-            where the recording tells no time.
+        serials: serial numbers by sensor, reported by the devices during the collection, else the profile's.
+        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
+            without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
         imported: when the last capture came into the session, in the same form; only where `date` is None.
     """
@@ -492,7 +476,7 @@ class Provenance:
 
     @property
     def date_words(self) -> str:
-        """The date, or "unknown, imported on 2026-11-23" where the recording tells none; "" for neither."""
+        """The date, or "unknown, imported on 2026-11-23" for a recording without times; "" for neither."""
         return self.date or (f"unknown, imported on {self.imported[:10]}" if self.imported else "")
 
 
@@ -534,9 +518,9 @@ class ResultFile:
     Attributes:
         rig: its name.
         made_by: the program and its version.
-        provenance: robot, sensors and date; empty in files of earlier versions.
+        provenance: robot, sensors and date.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
-        on_base: the pose of each sensor; None for two sensors, and in files of earlier versions.
+        on_base: the pose of each sensor; None for two sensors.
         pairs: one for each camera and LiDAR.
     """
 

@@ -39,7 +39,7 @@ def parse_json(data: bytes) -> Any:
 def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
     """Decode a PNG, JPEG, BMP, TIFF, PNM or WebP image.
 
-    OpenCV refuses images of more than OPENCV_IO_MAX_IMAGE_PIXELS (`lce_rig/__init__.py`).
+    OpenCV refuses images of more than OPENCV_IO_MAX_IMAGE_PIXELS, which the command line sets.
 
     Args:
         data: the file's bytes.

@@ -25,8 +25,7 @@ _COMPACT = "%Y%m%dT%H%M%SZ"
 
 
 class _TargetsFile(BaseModel):
-    # Those of a rig's profile of an earlier version are read, too.
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="forbid")
     targets: Annotated[dict[RobotName, TargetSettings], Field(min_length=1)]
 
 

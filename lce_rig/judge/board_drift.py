@@ -40,7 +40,7 @@ from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_H
 _BIAS = np.repeat([0.005, np.radians(0.1)], 3)
 _THRESHOLD_SIGMAS = 3.0  # of the change of one axis
 _POWER_SIGMAS = 1.645  # 95 % of the trials at the smallest change exceed the threshold.
-# Boards that see only larger changes cannot tell, m and rad.
+# Smallest detectable change, m and rad, beyond which the boards' opinion is unknown.
 _LARGEST = np.repeat([0.10, np.radians(1.5)], 3)
 _MIN_PLACEMENTS = 3  # Fewer do not determine the scatter.
 # Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
@@ -49,11 +49,11 @@ _CHANGED_CHI2 = 22.46
 
 @dataclass(frozen=True)
 class AxisDrift:
-    """What boards say about extrinsics along one axis, the others unchanged.
+    """The boards' opinion on extrinsics along one axis, the others unchanged.
 
     Attributes:
         axis: "translation_x" to "rotation_z", axes of the camera.
-        state: "unknown" where they cannot tell.
+        state: "unknown" if undetermined.
         change: from the extrinsics to those that fit best, m or deg.
         sigma: standard deviation of `change`, that of the extrinsics included.
         smallest: the smallest change that would be seen in 95 % of trials.

@@ -43,7 +43,7 @@ _CHANCE = 1e-3
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
-    """Weigh all captures of an estimate fully, to test what may explain them; None if they are too few.
+    """Weigh all captures of an estimate fully, to test explanations of them; None if they are too few.
 
     Args:
         estimate: of any method.

@@ -59,7 +59,7 @@ MOUNTINGS: tuple[Cause, ...] = ("moved", "groups", "alone", "drift")
 # Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried.
 _LEAST = -4.0
 # The same of explanations that are settled. Ring ends far from their edges count as strays, and (2)
-# understates what explains them: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
+# understates their gain: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
 # settled -146.
 _TRIED = -2.0
 # Prior standard deviations of freed constant errors: the size of users' mistakes.
@@ -310,7 +310,7 @@ class Table:
     def moves_of_rejected(self) -> list[Gain]:
         """List the moves before the last captures or after the first, half of which the estimate rejected.
 
-        Far from the common optimum their cost is not quadratic, and (2) understates what they gain.
+        Far from the common optimum their cost is not quadratic, and (2) understates their gain.
         """
         is_further = self.hypothesis.is_further
         if "moved" not in self.causes or self.hypothesis.mounting.any() or not is_further.any():

@@ -69,10 +69,6 @@ _CAUSES = {
     "captures": "the scatter of the captures",
     "lidar_ranges": "the LiDAR's constant range errors",
     "intrinsics": "the intrinsics",
-    # As in results of earlier versions.
-    "focal_length": "the focal length",
-    "principal_point": "the principal point",
-    "distortion": "the lens distortion",
     "square_size": "the size of the squares",
     "pattern_offset": "the pattern's place on the plate",
     "plate_size": "the plate's size",

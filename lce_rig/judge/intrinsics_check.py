@@ -50,14 +50,14 @@ _N_FOLDS = 2
 _KNOWN_PX = (1.0, 5.0)
 # Squared distance from the profile's intrinsics, in their standard deviations, of another lens.
 _OTHER_LENS = 36.0
-# Residuals so many times the noise, in the median image, are of another lens: in 17 sound sessions, 11 of
-# them recorded, they are 0.5 to 1.1 times as large, of a fisheye lens entered as radtan 6. Twice that fails.
+# Limit of residuals in the median image, in units of the noise, beyond which the lens is another one: 0.5 to
+# 1.1 in 17 sound sessions, 11 of them recorded; 6 for a fisheye lens entered as radtan. Twice that fails.
 _MISFIT, _FAIL = 2.0, 2.0
 # Variance of shears along the image's rows in the median image, in units of the corners' noise: in ten sound
 # recordings 0.1 to 2.0, in three of them with rows read out over 20 ms while boards move at 0.15 m/s 0.3
-# (corner noise 0.2 px), 8 and 11. Shears are printed for so many rows.
+# (corner noise 0.2 px), 8 and 11. Shears are printed per 100 rows.
 _READOUT, _ROWS = 4.0, 100.0
-# A model that fits is at least so many times as near.
+# Minimum ratio of the distances of the profile's model and of one that fits.
 _NEARER, _ALIKE = 2.0, 1.25
 _DEGREE, _LEAST_FREEDOMS = 3, 8
 
@@ -210,7 +210,7 @@ def judge_lens(
 
 
 def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> list[Finding]:
-    """Find given intrinsics that do not fit, and how they differ; none where they pass or were not compared.
+    """Return the finding of given intrinsics that do not fit, with their difference; else none.
 
     Args:
         check: of the intrinsics.

@@ -6,7 +6,7 @@ cost of all pairs falls by
 
     chi2 = h^T S^-1 h,    h = sum_p A_p^T h_p,    S = sum_p A_p^T S_p A_p                                  (1)
 
-Pairs count as independent, though they share images and scans: (1) ranks the sensors, and is no probability.
+Pairs count as independent, though they share images and scans: (1) ranks the sensors only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ _KNOWN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class PairCosts:
-    """Captures of two sensors, and what their costs say of a motion of either.
+    """Captures of two sensors, and their costs under a motion of either.
 
     Attributes:
         sensors: names of the first and the second.

@@ -2,7 +2,7 @@
 
 A point p = R q + t in the camera frame moves with the extrinsics by [I, -(p - t)^] times their tangent, as a
 rotation moves it about the LiDAR's origin; its pixel moves with the intrinsics as well. Both errors are
-correlated: a principal point that is off turns the extrinsics, which leaves pixels where they are.
+correlated: a wrong principal point turns the extrinsics, so that pixels hardly move.
 """
 
 from collections.abc import Sequence
@@ -82,7 +82,7 @@ def as_used(calibration: Calibration, lens: Intrinsics) -> Array:
     """Give the extrinsics (4, 4) that draw points with another lens as a result's own do with its intrinsics.
 
     Args:
-        calibration: with its intrinsics, else its extrinsics are given as they are.
+        calibration: with its intrinsics; without, its extrinsics are returned unchanged.
         lens: of the same camera model.
     """
     fitted, model = calibration.intrinsics, model_of(lens)

@@ -145,7 +145,7 @@ def compare_calibrations(
     lenses = [calibrations[name].intrinsics for name in names]
     lens, models = lenses[0], {each and (each.model, len(each.distortion)) for each in lenses}
     if lens is not None and len(models) == 1:
-        # What one session's lens turns, its own extrinsics take back.
+        # A session's extrinsics compensate the rotation of its own lens.
         calibrations = {name: replace(c, T_cam_lidar=as_used(c, lens)) for name, c in calibrations.items()}
         cov = np.array([calibrations[name].cov for name in names])
     else:
@@ -204,10 +204,10 @@ def compare_calibrations(
 
 
 def _displacements(first: Calibration, second: Calibration) -> dict[float, float]:
-    """Compute how far apart two results place a point, at the near and far distance of both boards.
+    """Compute the distance between a point by two results, at the near and far distance of both boards.
 
-    Rotation and translation of a result compensate each other where its boards were; what differs there
-    differs by any method.
+    Rotation and translation of a result compensate each other at its boards; a difference there remains with
+    any method.
     """
     distances = zip(first.board_distances_m, second.board_distances_m, strict=False)
     from_first = second.T_cam_lidar @ invert(first.T_cam_lidar)

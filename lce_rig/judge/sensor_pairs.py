@@ -235,7 +235,7 @@ def find_exchanged_cameras(
 
 
 def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> float:
-    """Compute by how much chi-squared about the nominal poses falls if two cameras are exchanged."""
+    """Compute the fall of chi-squared about the nominal poses if two cameras are exchanged."""
     nominal = [rig.nominal(each.name, lidar) for each in (first, second)]
     if None in nominal:
         return 0.0

@@ -112,7 +112,7 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
     """Pair the candidates of one capture that are closest to each other under known extrinsics.
 
     Centres and normals decide, the angle weighted by the plate's half diagonal; rotations in the plane do not
-    count, since a scan cannot tell a rectangle's.
+    count, since a rectangle in a scan is symmetric.
 
     Args:
         candidates: detections of both sensors.
@@ -148,7 +148,7 @@ class SessionCheck:
         findings: why these captures contradict it; empty if they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
-        scene: what the edges of the scene say of the extrinsics.
+        scene: the opinion of the scene's edges on the extrinsics.
         meetings: by capture, the boards of the residuals.
         page: shows the overlays of all captures, once they are drawn.
     """

@@ -94,7 +94,7 @@ def judge(
         n_misfits: images whose corners fit no pose of the board, as with a wrong lens.
 
     Returns:
-        The verdict, and its findings: the cause first, then what follows from it, then notes.
+        The verdict, and its findings: the cause first, then its consequences, then notes.
     """
     board, nominal, proof = rig.board.to_board(), rig.nominal(camera, lidar), estimate.certificate
     findings = [

@@ -88,7 +88,7 @@ class _Solved:
         estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
         lacking: why channels of the camera are not part of it.
-        together: the estimate of the sensors that it is part of; None where it stands alone.
+        together: the joint estimate that includes it; None if it was estimated separately.
     """
 
     pairs: tuple[Pair, ...]
@@ -114,11 +114,11 @@ class _Solved:
 
     @property
     def costs(self) -> PairCosts:
-        """What the captures say of a motion of either sensor."""
+        """Findings about a motion of either sensor."""
         return PairCosts.of((self.camera, self.lidar), self.estimate, self.validation)
 
     def evidence(self, detections: Detections) -> CameraEvidence:
-        """List what shows whether the images are of this camera, with its boards in the captures used."""
+        """List the figures that identify the camera, with its boards in the captures used."""
         channels = [channel.channel for channel in self.estimate.channels]
         views = []
         for name in sorted(self.estimate.captures_of(self.estimate.used)):
@@ -280,7 +280,7 @@ def calibrate_detections(
     moved = find_moved_sensor([own.costs for own in alone] + [own.costs for own in between])
     links, loops = _compare(rig, detections, alone), _open_loops(rig, alone, between)
     if moved is not None:
-        # What its pairs contradict follows from its motion.
+        # Contradictions of its pairs follow from its motion.
         links = [
             link._replace(contradictions=[]) if moved.name in link.sensors(alone) else link for link in links
         ]
@@ -331,7 +331,7 @@ def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibr
     for group in others:
         near, far = max(product(first, group), key=lambda pair: len(held[pair[0]] & held[pair[1]]))
         if held[near] & held[far]:
-            continue  # The pair's own shortage says what it lacks.
+            continue  # The pair's own shortage is reported.
         findings.append(
             UNCONNECTED(
                 " and ".join(group),
@@ -541,7 +541,7 @@ def _suspects(solved: Sequence[_Solved], link: _Link) -> tuple[int, ...]:
 
 
 def _is_sound(validation: Validation) -> bool:
-    """Check whether captures do not contradict each other so much that the result fails."""
+    """Return whether no contradiction between captures fails the result."""
     return all(cause.severity != "error" for cause in validation.causes)
 
 

@@ -67,7 +67,7 @@ class MeasuredIntrinsics:
         judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
             another lens model that fits them.
         misfit: how the profile's do not fit; None if they do, or are for another resolution.
-        weaknesses: what the captures do not determine, and what to do.
+        weaknesses: directions that the captures do not determine, with advice.
         refused: name of an image -> why the estimate does not use it.
     """
 
@@ -118,7 +118,7 @@ def measure_intrinsics(
         session: open for reading is enough.
         camera: its name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
-            or of events if there are no frames.
+            or else of events.
         model: name of a lens model; the profile's if None.
         progress: called with (done, total).
 
@@ -188,7 +188,7 @@ def measure_intrinsics(
 def _images_of(
     session: Session, camera: str, channels: Sequence[str]
 ) -> tuple[list[tuple[Capture, str]], dict[Key, ImageDetection]]:
-    """List a camera's images in a session, and what was detected in those that are made of raw events."""
+    """List a camera's images in a session, and the boards found in those reconstructed from raw events."""
     jobs = []
     for capture in session.captures:
         # Every channel reports a capture with a damaged manifest.
@@ -275,8 +275,7 @@ def _fit(
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step: a camera_info file for each camera.
 
-    Other files there stay, as those of cameras that an earlier run measured. Figures and plots that an
-    earlier version wrote of these cameras leave.
+    Other files there stay, as those of cameras that an earlier run measured.
 
     Returns:
         The files of this run.
@@ -286,10 +285,9 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
     """
     place = session.path / INTRINSICS
     names = {f"camera_info_{one.camera}.yaml": one for one in measured}
-    of_earlier = {"intrinsics.json", *(f"{one.camera}.png" for one in measured)}
 
     def finish(earlier: Path, draft: Path) -> None:
-        keep_foreign(earlier, draft, lambda path: path.name in of_earlier)
+        keep_foreign(earlier, draft, lambda _path: False)
 
     with replacing(session.path, place, finish) as draft:
         for name, one in names.items():

@@ -48,7 +48,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
 
     Raises:
         UsageError: fewer than two results; or a name is given twice, or cannot be one.
-        SessionError: there is no result of that name, or one cannot be read.
+        SessionError: a named result is missing, or one cannot be read.
     """
     session = Session.open(folder)
     stored = {each.name: each for each in stored_results(session)}

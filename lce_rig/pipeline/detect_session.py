@@ -35,7 +35,7 @@ from lce_rig.session.durable import load_arrays, store_arrays
 Key = tuple[str, str]
 _ImageJob = tuple[Capture, str, str]
 _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
-#: So many captures must agree on extrinsics, and more than half of them, before others are looked at again.
+#: Minimum number of captures that agree on extrinsics, beside a majority, before others are searched again.
 _LEAST_AGREEING = 5
 
 

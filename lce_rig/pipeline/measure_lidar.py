@@ -29,7 +29,7 @@ from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 
-# A laser's range must be known so much better than before for a profile to state it.
+# Minimum ratio of a laser's range deviation before and after, for the profile to state the new value.
 _LEAST_GAIN = 2.0
 _FEWEST_CAPTURES = 8
 _STILL = "Give sessions whose board stood still, on a stand. Leave this one out."

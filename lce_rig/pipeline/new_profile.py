@@ -94,14 +94,14 @@ def new_profile(
         name: of the rig.
         board: as it was measured.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
-            folder with images and point clouds. The beams of a LiDAR of no known model are measured in it.
-        lidar_model: maker's name of the LiDAR's model; None where it is not known.
-        cameras: names of the cameras, in the order of their topics where there is a bag.
-        intrinsics: of the cameras, in the same order, or one file for all; those of a bag where it is empty.
-        source: what to call the text in errors.
+            folder with images and point clouds. The beams of an unknown LiDAR are measured in it.
+        lidar_model: maker's name of the LiDAR's model; None if unknown.
+        cameras: names of the cameras, in the order of a bag's topics.
+        intrinsics: of the cameras, in the same order, or one file for all; empty to read the bag's.
+        source: name of the text in errors.
 
     Returns:
-        The text; and what was found and chosen, a line each.
+        The text; and a line for each value found or chosen.
 
     Raises:
         UsageError: a camera without intrinsics, or names or intrinsics of cameras that are not there.
@@ -213,9 +213,9 @@ def _lidar(
     Args:
         name: of the LiDAR.
         model: as it was named.
-        notes: receives in what the cloud's rings differ from the model's.
+        notes: receives differences between the rings of cloud and model.
         topic: that the cloud is from; None without a bag.
-        cloud: one scan; None where there is none.
+        cloud: one scan; None without one.
         where: file or topic, for messages.
     """
     block: dict[str, Any] = {"model": model, "frame": f"{name}_link"}
@@ -225,7 +225,7 @@ def _lidar(
         block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
         rate_hz = round(topic.rate_hz or 0.0, 1)
         # Single scans, seconds apart, say nothing of how fast the LiDAR turns; without rings, scans are
-        # accumulated to the rate of the profile, whatever rate they come at.
+        # accumulated to the rate of the profile.
         block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ and settings.has_rings else {}
     if sheet is not None and sheet.has_rings and cloud is not None:
         try:
@@ -394,7 +394,7 @@ def _image_size(images: Sequence[Path]) -> tuple[int, int] | None:
 
 
 def _rough_lens(size_px: tuple[int, int] | None) -> str:
-    """Advise intrinsics to start from where none were measured."""
+    """Advise approximate intrinsics for cameras without measured ones."""
     width, height = size_px or _USUAL_SIZE_PX
     middle = f"{width / 2:g},{height / 2:g},0,0,0,0"
     lens = f"radtan,{width}x{height},{0.8 * width:.0f},{0.8 * width:.0f},{middle}"

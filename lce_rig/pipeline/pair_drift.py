@@ -1,4 +1,4 @@
-"""What a scene, and the boards in view, say about the deployed extrinsics of a camera and a LiDAR."""
+"""Compare the deployed extrinsics of a camera and a LiDAR with a scene and the boards in view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -46,9 +46,9 @@ class Seen(NamedTuple):
 
     Attributes:
         name: of the capture, or its time.
-        image: what the camera saw, or else events of 20 ms.
+        image: of the camera; without one, 20 ms of events.
         scan: of the LiDAR.
-        previous: the scan before, where the recording is continuous.
+        previous: the scan before, in a continuous recording.
     """
 
     name: str
@@ -59,12 +59,12 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PairDrift:
-    """What a scene says about one camera and LiDAR.
+    """One camera and LiDAR compared with a scene.
 
     Attributes:
         calibration: the deployed extrinsics.
         drift: the scene's opinion; where images show the board, without its edges.
-        board: the board's own; None where both sensors see it in fewer than three placements.
+        board: the board's opinion; None with fewer than three placements that both sensors see.
         example: the capture drawn by `write`; None without any.
     """
 
@@ -77,7 +77,7 @@ class PairDrift:
     def state(self) -> State:
         """The verdict: a change that one opinion finds and the other does not refute.
 
-        It holds if either opinion covers it, and is unknown where they contradict each other.
+        It holds if either opinion covers it, and is unknown if they contradict each other.
         """
         states: list[State] = [self.drift.state, *([] if self.board is None else [self.board.state])]
         if self.contradictions:
@@ -95,7 +95,7 @@ class PairDrift:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What contradicts, then the scene's opinion, then the board's."""
+        """Contradictions, then the scene's opinion, then the board's."""
         board = () if self.board is None else self.board.findings
         return (*self.contradictions, *self.drift.findings, *board)
 
@@ -123,12 +123,12 @@ class PairDrift:
 
 @dataclass(frozen=True, eq=False)
 class DriftReport:
-    """What a scene says about the extrinsics of a result.
+    """The extrinsics of a result compared with a scene.
 
     Attributes:
         rig: the profile.
         pairs: one for each camera and LiDAR of the result.
-        notes: what was chosen, assumed or could not be read, in words.
+        notes: choices, assumptions and unreadable files, in words.
     """
 
     rig: Rig
@@ -189,7 +189,7 @@ class PairJudge:
                     boards.append((seen, board))
             views.append(view)
         if boards:
-            # Who holds the board moves with it.
+            # The person with the board moves with it.
             views = without_movers(views)
         judged = watch_scene(views, lens, c)
         others: list[Finding] = []
@@ -225,7 +225,7 @@ class PairJudge:
         )
 
     def _motion(self, seen: Seen) -> RigMotion | None:
-        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
+        """Estimate the rig's motion at a capture; None if it stands still or cannot be estimated."""
         if seen.previous is None:
             return None
         key = id(seen.scan)
@@ -236,7 +236,7 @@ class PairJudge:
 
 
 def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
-    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
+    """Compute the time from each edge (N, 3) to the image; None if times are unknown."""
     image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
     image_ns = rig_time_ns(image, rig)
     fired_s = firing_times_s(seen.scan, points)
@@ -258,6 +258,6 @@ def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, 
 
 
 def own_offset_ns(c: Calibration, channel: str) -> int:
-    """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
+    """Return a channel's calibrated time offset minus the one that the profile expects."""
     found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
     return round(1e9 * found[0]) if found and found[0] is not None else 0

@@ -212,7 +212,7 @@ def with_profile_of(session: Session, name: str | None) -> Session:
 
 
 def _own_profile(session: Session, name: str | None) -> Path | None:
-    """Return the path of the profile stored beside a result; None where it has the session's."""
+    """Return the path of the profile stored beside a result; None if it uses the session's."""
     folder = result_folder(session.path, name)
     is_named = (session.path / RESULTS) in folder.parents
     return folder / PROFILE if is_named and (folder / PROFILE).is_file() else None
@@ -237,7 +237,7 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration], profile
     digests = {PROFILE: hashlib.sha256(profile).hexdigest()}
     held = {capture.name: capture for capture in session.captures}
     for name in sorted({name for calibration in calibrations for name in calibration.captures_used}):
-        # `Session.capture` raises where one is missing; it lists the folder each time.
+        # `Session.capture` raises for a missing one; it lists the folder each time.
         capture = held.get(name) or session.capture(name)
         digests[f"{CAPTURES}/{name}/{MANIFEST}"] = capture.manifest_sha256
     return digests
@@ -351,7 +351,7 @@ def stored_results(session: Session) -> list[StoredResult]:
 
 
 def result_content(folder: Path) -> bytes | None:
-    """Read the result.json of a folder; None where there is no such file.
+    """Read the result.json of a folder; None without one.
 
     Raises:
         SessionError: it cannot be read.

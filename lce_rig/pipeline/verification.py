@@ -50,7 +50,7 @@ class Verification:
         detections: of the session.
         own_result: content of the session's result.json if the calibrations come from it, else None.
         name: of that result; None for the one in calibration/.
-        notes: in what the session's profile differs from the result's.
+        notes: differences between the profiles of session and result.
     """
 
     session: Session
@@ -144,7 +144,7 @@ def verify(
         progress: called with (done, total) while the board is detected.
 
     Raises:
-        SessionError: there is no result, it belongs to another rig, or the session has no captures of its
+        SessionError: the result is missing or belongs to another rig, or the session has no captures of its
             sensors.
     """
     calibrations, own_result = _extrinsics(session, result, name)
@@ -188,7 +188,7 @@ def profile_behind(path: Path, result: ResultFile) -> Rig | None:
     """Read the profile with which a result was made: that of the session around result.json.
 
     Returns:
-        None where there is no such profile, or where it is not the one that the result names.
+        None if it is missing, or is not the one that the result names.
     """
     digests = result.inputs_sha256.values()
     # As deep as results/NAME/previous/result.json lies in its session.
@@ -207,7 +207,7 @@ def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, .
 
     Args:
         rig: of the samples.
-        profile: of the result; None where it is not known.
+        profile: of the result; None if unknown.
     """
     if profile is None:
         return rig, ()

@@ -71,11 +71,11 @@ class SceneCaptures:
     Args:
         rig: the profile.
         result: the deployed extrinsics.
-        source: what is read, for messages.
+        source: its name in messages.
 
     Attributes:
         kept: by index of the result's pairs.
-        notes: what was chosen, assumed or could not be read, in words.
+        notes: choices, assumptions and unreadable files, in words.
 
     Raises:
         SessionError: the result belongs to another rig.
@@ -101,7 +101,7 @@ class SceneCaptures:
         self._last: dict[str, Scan] = {}
 
     def take_session(self, session: Session, progress: Progress) -> None:
-        """Read the captures of a session; what is damaged is skipped."""
+        """Read the captures of a session; skip damaged ones."""
         cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
         captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
         for done, capture in enumerate(captures, start=1):
@@ -132,7 +132,7 @@ class SceneCaptures:
             except SourceError as error:
                 if not any(self.kept):
                     raise
-                # What came before the damage is judged.
+                # Samples before the damage are judged.
                 self.notes.append(f"not read to its end: {error.what}")
             self.notes += recording.notes
 
@@ -172,7 +172,7 @@ class SceneCaptures:
             self.notes += [error.what for error, _ in sensors.lost().values()]
 
     def take_frame(self, frame: Frame) -> None:
-        """Take what the rig saw at one time of a continuous recording."""
+        """Take the rig's samples of one time of a continuous recording."""
         self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
         self._last = {scan.sensor: self._rig.corrected(scan) for scan in frame.scans}
 
@@ -197,7 +197,7 @@ class SceneCaptures:
                 kept.take(Seen(name, image, scan, self._last.get(c.lidar)))
 
     def judge(self) -> DriftReport:
-        """Judge the result by what was taken.
+        """Judge the result by the samples taken.
 
         Raises:
             SourceError: nothing of any camera and LiDAR of the result.
@@ -253,7 +253,7 @@ def drift(
         progress: called with (done, total) captures, or images and scans.
 
     Raises:
-        SessionError: there is no result, it belongs to another rig, or the session cannot be read.
+        SessionError: the result is missing or belongs to another rig, or the session cannot be read.
         SourceError: a recording cannot be read, or holds nothing of any camera and LiDAR of the result.
     """
     paths = [Path(each) for each in ([source] if isinstance(source, str | Path) else source)]
@@ -283,7 +283,7 @@ def drift_live(
     *,
     is_over: Callable[[int], bool],
 ) -> DriftReport:
-    """Compare the extrinsics of a result with what attached sensors see.
+    """Compare the extrinsics of a result with samples of attached sensors.
 
     Args:
         rig: the profile.

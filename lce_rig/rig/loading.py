@@ -296,6 +296,8 @@ def _problem(detail: ErrorDetails, schema: type[BaseModel]) -> tuple[KeyPath, st
     what = detail["msg"]
     for old, new in _REWORDED:
         what = what.replace(old, new)
+    if kind == "less_than_equal" and any(str(part).endswith("_m") for part in path):
+        return path, f"{what} m; {value} given: write metres", None
     return path, f"{what}; {value} given", None
 
 

@@ -1,10 +1,10 @@
 """The profile of a rig: start reading the schema here."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
@@ -51,15 +51,7 @@ OutputFormat = Literal[
 ]
 
 
-def _isaac_is_urdf(formats: Any) -> Any:
-    """Replace `isaac`, an earlier version's name, by the URDF format."""
-    if not isinstance(formats, list | tuple) or "isaac" not in formats:
-        return formats
-    others = [name for name in formats if name != "isaac"]
-    return others if "urdf" in others else [*others, "urdf"]
-
-
-OutputFormats = Annotated[tuple[OutputFormat, ...], BeforeValidator(_isaac_is_urdf)]
+OutputFormats = tuple[OutputFormat, ...]
 
 SWAPPED_SIDES = Kind(
     "profile.swapped_sides",
@@ -265,8 +257,6 @@ class Rig(Settings):
         nominal_extrinsics: the CAD model's values, a sanity check only.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
-
-    RETIRED: ClassVar = frozenset({"reconstruction", "targets", "verdict"})
 
     format_version: Literal[1]
     name: RigName

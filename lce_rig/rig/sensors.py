@@ -1,6 +1,6 @@
 """The sensors' blocks of a profile: LiDARs, cameras, their channels, drivers and clocks."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -149,8 +149,6 @@ class LidarSettings(Settings):
             `range_offset_m`.
         intrinsics: measured constant errors; None if there are none.
     """
-
-    RETIRED: ClassVar = frozenset({"azimuth_offset_sigma_deg"})
 
     model: Text = VLP_16.name
     serial: Text | None = None

@@ -1,6 +1,6 @@
 """Base class and shared types of the profile's settings."""
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -36,14 +36,9 @@ Rate = Annotated[float, Field(ge=0.1, le=10_000)]
 
 
 class Settings(BaseModel):
-    """A block of a profile: immutable, no unknown keys, no infinities.
-
-    Attributes:
-        RETIRED: keys of the block in earlier versions: they are read, and nothing depends on them.
-    """
+    """A block of a profile: immutable, no unknown keys, no infinities."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    RETIRED: ClassVar[frozenset[str]] = frozenset()
 
     @model_validator(mode="before")
     @classmethod
@@ -54,7 +49,7 @@ class Settings(BaseModel):
         for key, value in data.items():
             if any(isinstance(item, bool) for item in (value if isinstance(value, list) else [value])):
                 raise problem("a truth value (true, yes, on, false, no, off) is not allowed", str(key))
-        return {key: value for key, value in data.items() if key not in cls.RETIRED}
+        return data
 
 
 def require(is_met: bool, what: str, key: str = "") -> None:

@@ -45,11 +45,11 @@ def colour_points(
 
 
 def _is_hidden(at: Array, depth_m: Array, cell_px: float, baseline_m_px: float) -> NDArray[np.bool_]:
-    """Find the points behind nearer ones that the LiDAR looks past and the camera does not.
+    """Find the points that a nearer surface hides from the camera, but not from the LiDAR.
 
     In a cell of the image as large as the gap between rings, the point at depth d shifts against the nearest
     one, at d0, by baseline * f * (1 / d0 - 1 / d) between the views of camera and LiDAR. Below half a cell
-    both are parts of what both sensors see.
+    both sensors see both.
     """
     cells = np.floor(at / cell_px).astype(int)
     _, place = np.unique(cells, axis=0, return_inverse=True)

@@ -13,7 +13,7 @@ from lce_rig.core.interrupts import without_interrupt
 from lce_rig.scene.edge_pyramid import SIGMAS_RAD
 from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 
-# Scans of a standing rig differ by less in a tenth of a second: noise, and people who pass by.
+# Motion limits of a standing rig over 0.1 s, beyond noise and people passing by.
 _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
 _LONGEST_GAP_S = 0.5
 _VOXEL_M = 0.15
@@ -22,7 +22,7 @@ _ROBUST_M = 0.1  # Residuals beyond this hardly count: people and cars move othe
 _MIN_FITNESS = 0.5
 _NORMALS_M = 0.8
 _CLOCKS_S = np.linspace(-0.15, 0.15, 31)
-# Clocks nearer to each other than this are not told from motion that is not quite constant.
+# Smallest time offset that cannot come from motion that is not quite constant, s.
 _APART_S = 0.02
 _APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
 # Share of the score below which clocks explain images less well than changed extrinsics do.
@@ -43,7 +43,7 @@ class RigMotion:
 
     @property
     def is_still(self) -> bool:
-        """Whether it is too slow to be told from none."""
+        """Whether it is too slow to be significant."""
         return bool(
             np.linalg.norm(self.velocity_mps) < _STILL_MPS and np.linalg.norm(self.rate_rad_s) < _STILL_RAD_S
         )
@@ -65,7 +65,7 @@ class RigMotion:
 def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
     """Estimate a rig's motion from two consecutive scans: point-to-plane ICP with a robust loss.
 
-    A corridor does not tell how fast a rig moves along it.
+    In a corridor the speed along it is undetermined.
 
     Returns:
         None where the scans have no timestamps, are not consecutive, or do not match.
@@ -100,7 +100,7 @@ def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
 
 
 def firing_times_s(scan: Scan, points: Array) -> Array | None:
-    """Tell when points (N, 3) of a scan, or beside its returns, were seen: s after its first firing."""
+    """Compute the time of points (N, 3) of a scan, or beside its returns, s after its first firing."""
     from scipy.spatial import cKDTree
 
     if scan.offset_ns is None or not len(scan.points):
@@ -121,7 +121,7 @@ class MovingView:
 def clocks_apart_s(
     views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_lidar: Array, T_changed: Array | None = None
 ) -> float | None:
-    """Find by how much images come later than their timestamps say, from captures of a moving rig.
+    """Estimate the delay of images after their timestamps, from captures of a moving rig.
 
     The score is searched along the time of the images, at the finest width of the fields.
 
@@ -132,8 +132,8 @@ def clocks_apart_s(
         T_changed: (4, 4) changed extrinsics that explain the images otherwise.
 
     Returns:
-        None where the edges fit at the time that the timestamps say, the motion is too slow to tell, or
-        changed extrinsics explain the images better.
+        None if the edges fit without a delay, the motion is too slow, or changed extrinsics explain the
+        images better.
     """
     rows = []
     for after_s in _CLOCKS_S:

@@ -1,4 +1,4 @@
-"""What a scan and an image of one capture show of the scene's edges, with or without those at the board."""
+"""The scene's edges in a scan and an image of one capture, with or without those at the board."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,7 +59,7 @@ def without_board(
 
 
 def without_movers(views: Sequence[OutlineView]) -> list[OutlineView]:
-    """Leave out the edges of what moves before a standing rig, such as who holds the board.
+    """Remove the edges of things that move before a standing rig, such as the person with the board.
 
     An edge stays if a third of the other captures, and one at least, have one in its place; it may be hidden
     in the rest. Where few edges stay, the rig itself moves, and all are kept.

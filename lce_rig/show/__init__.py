@@ -1,1 +1,1 @@
-"""What people see: overlays, reports, the live screen, the phone page."""
+"""Views for people: overlays, reports, the live screen, the phone page."""

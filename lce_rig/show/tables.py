@@ -163,7 +163,7 @@ _FIGURES = ("planes", "edges", "held out", "corners")
 
 
 def _capture_rows(c: Calibration) -> list[Row]:
-    """List the residuals of each capture, "" where there is none."""
+    """List the residuals of each capture, "" for none."""
     rows: list[Row] = []
     for r in c.residuals:
         sizes_m = (r.plane_mean_m, r.edge_mean_m, r.held_out_m)
@@ -173,7 +173,7 @@ def _capture_rows(c: Calibration) -> list[Row]:
 
 
 def _channel_rows(c: Calibration) -> list[Row]:
-    """List figures of the channels, a column each; none where one channel saw still boards."""
+    """List figures of the channels, a column each; none for one channel of still boards."""
     if len(c.channel_results) < 2 and all(r.time_offset_s is None for r in c.channel_results):
         return []
     offsets = [

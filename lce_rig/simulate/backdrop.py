@@ -85,14 +85,18 @@ class Backdrop:
         return np.asarray(self.T_world_cam[:3, 3])
 
 
-def build_backdrop(room: Room, T_world_cam: Array, intrinsics: Intrinsics) -> Backdrop:
-    """Render the standing room as a camera at T_world_cam (4, 4) sees it."""
+def build_backdrop(
+    room: Room, T_world_cam: Array, intrinsics: Intrinsics, *, is_draft: bool = False
+) -> Backdrop:
+    """Render the standing room as a camera at T_world_cam (4, 4) sees it; a draft without anti-aliasing."""
     shape = (intrinsics.height_px, intrinsics.width_px)
     origin = T_world_cam[:3, 3]
     corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
     rays = pixel_rays(corners).reshape(-1, 3)
     flat, range_m = _render(room, origin, rays)
     radiance = flat.reshape(*shape, 3)
+    if is_draft:
+        return Backdrop(intrinsics, T_world_cam, corners, radiance, range_m.reshape(shape), room.lamps)
     # Resample the pixels that differ much from a neighbour.
     tone = np.sqrt(np.clip(radiance.mean(axis=2), 0.0, 1.0))
     down, across = (np.abs(np.diff(tone, axis=axis)) > _EDGE_TONE for axis in (0, 1))

@@ -24,7 +24,7 @@ class LiveScene:
 
     For a held board, images are rendered and beams are traced once; each image and scan has its own
     noise. On its way, when nothing is captured, both are drafts: images without shadows and anti-aliasing,
-    infinitely thin beams.
+    infinitely thin beams. The room is always a draft, so that a collection starts sooner.
 
     Attributes:
         stage: the simulated rig and its room.
@@ -37,7 +37,7 @@ class LiveScene:
         Raises:
             ProfileError: a LiDAR's model is unknown, or no camera can be simulated.
         """
-        self.stage = set_stage(rig, seed, options)
+        self.stage = set_stage(rig, seed, options, is_draft=True)
         self._noise = self.stage.rng(OF_SESSION, _NOISE_STREAM)
         self._show(np.eye(4), is_held=True)
 

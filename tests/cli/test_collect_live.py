@@ -73,6 +73,14 @@ def test_collect_unusable_preview_is_refused(lce_rig, tmp_path):
             assert "starting" not in result.err and not path.exists() and not record.exists()
 
 
+def test_collect_preview_before_session_is_flag(lce_rig, tmp_path):
+    """The word after the option is the session, unless it is an address."""
+    session = tmp_path / "real"
+    (session / "captures/000000").mkdir(parents=True)
+    result = lce_rig("collect", "--rig", "rles", "--simulated", "--preview", session)
+    assert result.code == 4 and str(session) in result.err
+
+
 def start(path, *arguments, rig="rles", **options):
     command = [sys.executable, "-m", "lce_rig", "collect", "--rig", rig, str(path), "--simulated", *arguments]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)

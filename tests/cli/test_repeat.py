@@ -119,6 +119,7 @@ def test_repeat_failed_calibration_is_error(lce_rig, made):
     (found,) = compared(lce_rig, *sessions, code=7)["findings"]
     assert (found["code"], found["severity"], found["subject"]) == ("repeat.failed", "error", "bad")
     assert found["figures"] == {"camera": "davis", "lidar": "lidar"}
+    assert "agree, but the calibration of bad" in lce_rig("repeat", *sessions).err
 
 
 def test_repeat_no_common_sensor_is_refused(lce_rig, made):

@@ -22,7 +22,6 @@ from lce_rig.core.calibration import (
     read_result,
 )
 from lce_rig.core.errors import ResultRefusedError, SessionError
-from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import exp_so3, pose
 from tests.damage import damaged
 from tests.export.conftest import calibration, reason
@@ -187,42 +186,6 @@ def test_keys_of_later_versions_are_ignored(tmp_path):
         document["later"] = document["pairs"][0]["later"] = {"x": 1}
 
     assert len(read_result(edited(tmp_path / "result.json", of_tomorrow)).pairs) == 1
-
-
-def test_files_of_earlier_versions_are_read(tmp_path):
-    """They hold no provenance, hashes or findings, and refusals in words only."""
-
-    def as_before(document):
-        del document["inputs_sha256"]
-        pair = document["pairs"][0]
-        for key in FIELDS[FIELDS.index("reasons") + 1 :]:
-            del pair[key]
-        pair["reasons"] = [REASON]
-        pair["captures_refused"] = {"000001": {"stage": "lidar", "cause": "2 rings", "action": "come closer"}}
-
-    file = read_result(edited(tmp_path / "result.json", as_before))
-    assert file.inputs_sha256 == {} and file.provenance == Provenance()
-    undated = {"robot": "", "serials": {}, "date": "", "session_sha256": ""}
-    path = edited(tmp_path / "result.json", lambda document: document.update(provenance=undated))
-    assert read_result(path).provenance.date is None
-    (pair,) = file.pairs
-    assert pair.channels == ("events", "frames") and pair.method == "paper" and not pair.cov_shared.any()
-    (refusal,) = pair.captures_refused.values()
-    assert refusal == Refusal("lidar.text")
-    assert (refusal.text, refusal.advice) == ("2 rings", "come closer")
-    (finding,) = pair.findings
-    assert (finding.severity, finding.sentence) == ("warning", REASON)
-    assert file.document()["pairs"][0]["reasons"] == [REASON]
-
-
-def test_scene_of_earlier_version_keeps_its_state(tmp_path):
-    axis = {"axis": "rotation_x", "state": "unchanged", "change": -0.1, "sigma": 0.2, "smallest": None}
-
-    def as_before(document):
-        document["pairs"][0]["scene"] = {"state": "agrees", "n_captures": 2, "n_edges": 7, "axes": [axis]}
-
-    (pair,) = read_result(edited(tmp_path / "result.json", as_before)).pairs
-    assert (pair.scene.state, pair.scene.n_edges, pair.scene.change) == ("agrees", 7, None)
 
 
 def test_findings_of_another_version_keep_their_words(tmp_path):

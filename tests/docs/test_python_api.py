@@ -17,6 +17,12 @@ def test_importing_it_imports_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
+def test_import_leaves_environment():
+    script = "import os; before = dict(os.environ); import lce_rig.core.files; print(os.environ == before)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
 def test_every_public_name_is_there_and_on_the_page():
     words = PAGE.read_text(encoding="utf-8")
     for name in lce.__all__:

@@ -40,12 +40,6 @@ def test_targets_empty_file_gets_own_advice(tmp_path, text):
     assert "rigs new" not in caught.value.hint
 
 
-def test_target_isaac_format_becomes_urdf(tmp_path):
-    text = "targets: {heron: {to: /opt, formats: [isaac]}, kestrel: {to: /opt, formats: [isaac, urdf]}}"
-    targets = read_targets(write(tmp_path / "deploy.yaml", text))
-    assert [target.formats for target in targets.values()] == [("urdf",), ("urdf",)]
-
-
 @pytest.mark.parametrize(
     ("to", "host", "path"),
     [

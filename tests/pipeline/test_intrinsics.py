@@ -133,12 +133,12 @@ def test_intrinsics_keep_files_of_others(pictures, measured, tmp_path):
     session = session_of(tmp_path / "session", pictures[:1])
     folder = session.path / "intrinsics"
     folder.mkdir()
-    for name in ("intrinsics.json", "davis.png", "camera_info_other.yaml", "notes.txt"):
+    for name in ("camera_info_davis.yaml", "camera_info_other.yaml", "notes.txt"):
         (folder / name).write_text("earlier")
     other = replace(measured, camera="longer_than_the_name_of_a_file" * 10)
     with pytest.raises(SessionError):
         write_intrinsics(session, [measured, other])
-    assert (folder / "davis.png").read_text() == (folder / "intrinsics.json").read_text() == "earlier"
+    assert (folder / "camera_info_davis.yaml").read_text() == "earlier"
     assert write_intrinsics(session, [measured]) == [folder / "camera_info_davis.yaml"]
     kept = {"camera_info_davis.yaml", "camera_info_other.yaml", "notes.txt"}
     assert {path.name for path in folder.iterdir()} == kept

@@ -161,7 +161,7 @@ def _expand(Q: Array, R: Array) -> tuple[Array, Array, Array]:
 
 
 def _newton_step(hessian: Array, gradient: Array, damping: Array) -> tuple[Array, NDArray[Any]]:
-    """Solve for the damped step (B, 3), at most 1 rad long, and tell where the Hessian is positive."""
+    """Solve for the damped step (B, 3), at most 1 rad long, and mark positive Hessians."""
     values, vectors = np.linalg.eigh(hessian)
     is_convex = values[:, 0] + damping > 0
     size = np.abs(values)

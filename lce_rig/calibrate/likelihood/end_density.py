@@ -8,7 +8,7 @@ hit the board and the first that did not. Three effects blur that:
 
 core   the uniform interval, its ends blurred by t (pattern, width of the beam); it determines the edge
        better than a normal distribution of the same variance;
-lost   the last returns on the board are missing (weak, or merged with the person who holds it): an
+lost   the last returns on the board are missing (weak, or merged with the person behind it): an
        exponential tail inwards, for few ring ends with a stand, for a fifth with a person behind the board;
 stray  anything else (the neighbouring ray hit an object just behind the board), a Cauchy distribution.
 """
@@ -103,7 +103,7 @@ def edge_products(
     first = np.flatnonzero(np.diff(group, prepend=-1))
     counts = np.diff(first, append=len(J))
     products = np.zeros((len(first), J.shape[1] + 1, J.shape[1] + 1))
-    # A ring has two ends on a board, and more where it is hidden in part.
+    # A ring has two ends on a board, and more on one that is partly hidden.
     for n in np.unique(counts).tolist():
         at = first[counts == n, None] + np.arange(n)
         products[counts == n, :-1] = np.swapaxes(J[at], 1, 2) @ weighted[at]

@@ -91,7 +91,7 @@ class Layout:
         n_optics: number of unknowns of each lens.
         n_rings: L.
         lens_of: number of the lens of each camera, its own by default. A camera that moved counts as two.
-        base: the camera in whose frame the boards' poses are, where there is no LiDAR.
+        base: the camera in whose frame the boards' poses are, without a LiDAR.
 
     Attributes:
         z: places in the vector of the unknowns that captures share.

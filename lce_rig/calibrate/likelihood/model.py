@@ -156,7 +156,7 @@ def _of_images(terms: Terms, levels: Levels) -> Iterator[Products]:
 
 
 def _of_own_shifts(terms: Terms, levels: Levels) -> Iterator[Products]:
-    """Weight what is known of the captures' own shifts: [shift; 1] (shift + value) / sigma."""
+    """Weight the prior of the captures' own shifts: [shift; 1] (shift + value) / sigma."""
     rows = np.stack([np.ones_like(terms.trust), terms.state.own_shift_m], axis=1) / levels.own_shift_m
     F = len(rows)
     place = np.tile(terms.state.layout.row.of(["own_shift", "residual"]), (F, 1))
@@ -340,7 +340,7 @@ def _reduce(terms: Terms, summed: Summed, levels: Levels, priors: Priors) -> Red
 
 
 def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced:
-    """Eliminate the own unknowns of F captures and add what is known of the others.
+    """Eliminate the own unknowns of F captures and add the information on the others.
 
     Args:
         summed: products of rows of n_own own unknowns, G others and the residual.

@@ -49,8 +49,8 @@ from lce_rig.core.geometry import Array, perturb, relative_pose, skew
 # Maximum number of steps, and the length of the next one that ends them, in standard deviations.
 _STEPS, _SETTLED = 20, 5e-3
 _POSE = OWN["pose"].stop
-# A lens, lateral and vertical, follows from how ring ends shear an oblique plate. Errors of their model that
-# all boards share, and that no scatter shows, displaced it by so much in simulated sessions of an OS1-64.
+# Standard deviation of a LiDAR's lens, lateral and vertical, m, from errors of the ring ends' model that all
+# boards share: measured in simulated sessions of an OS1-64. The scatter does not contain them.
 _LENS_ERROR_M = np.array([0.0025, 0.0015])
 
 

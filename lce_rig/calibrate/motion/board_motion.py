@@ -36,7 +36,7 @@ class PoseSamples:
     Attributes:
         channels: names of the channels.
         T_cam_board: (F, J, 4, 4).
-        information: (F, J, 6, 6) inverse covariance, zero if there is no image.
+        information: (F, J, 6, 6) inverse covariance, zero without an image.
         time_s: (F, J) after the scan's timestamp, by the profile's clocks.
         channel: (F, J) index into `channels`.
     """
@@ -151,7 +151,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
 
     Args:
         samples: of F captures.
-        offset_s: (C,) what to add to the images' times, by channel.
+        offset_s: (C,) added to the images' times, by channel.
         only: a channel that alone gives the board's position; the others then only give its motion.
 
     References:
@@ -189,7 +189,7 @@ def _disagreement(
 ) -> Array:
     """Measure squared residuals (F,) of images under motions that were estimated without them.
 
-    Another camera pose, the same in all captures, is no residual: its tangent (tau, phi) moves the
+    Another camera pose, the same in all captures, does not count: its tangent (tau, phi) moves the
     board at c by tau + phi x c.
     """
     f, j = np.nonzero(is_silent & (samples.information[..., 0, 0] > 0))

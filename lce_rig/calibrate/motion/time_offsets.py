@@ -238,7 +238,7 @@ def _search_grid(
         motions = fit_motions(samples, offset_s)
         T_cam_board = motions.at(times_s)
         depth = np.sum((T_cam_board[:, :3, 3] - transform(T, middles)) * T_cam_board[:, :3, 2], axis=1)
-        # The extrinsics adapt: what their six small motions explain is no residual.
+        # The extrinsics adapt: their six small motions are projected out of the residuals.
         J = differentiate(T_cam_board[:, :3, 2], middles @ T[:3, :3].T)
         misfit = np.abs(depth - J @ np.linalg.lstsq(J, depth, rcond=None)[0])
         cost = 2 * len(misfit) * np.log(np.median(misfit) + 1e-3)

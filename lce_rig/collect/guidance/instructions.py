@@ -15,7 +15,7 @@ from lce_rig.core.geometry import Array, exp_so3
 Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 STEP_M = 0.6
-MOST_AT_ONCE = 3
+_ROTATIONS = ("tilt", "turn", "roll")
 #: Differences, m and deg, below which no instruction is given: people cannot follow smaller ones.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
 #: Tolerance of every figure of a board at its wanted pose, in dead bands.
@@ -83,7 +83,7 @@ def build_pose(view: SensorPlace, held: HeldPose) -> Array:
 
 
 def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str]:
-    """List the moves to make, largest first, at most `MOST_AT_ONCE`; empty at the wanted pose.
+    """List the moves to make, those of place before rotations, the largest first; empty at the wanted pose.
 
     Args:
         view: the sensors.
@@ -93,13 +93,15 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str
     changes = _changes(view, present, wanted)
     # Dead bands make ways and angles comparable.
     sizes = {kind: abs(amount) / DEAD_BANDS[kind] for kind, amount in changes.items()}
-    largest = sorted((kind for kind in sizes if sizes[kind] > 1), key=lambda kind: -sizes[kind])
-    return {kind: _in_words(kind, changes[kind]) for kind in largest[:MOST_AT_ONCE]}
+    ordered = sorted(
+        (kind for kind in sizes if sizes[kind] > 1), key=lambda kind: (kind in _ROTATIONS, -sizes[kind])
+    )
+    return {kind: _in_words(kind, changes[kind]) for kind in ordered}
 
 
 def say(instructions: Mapping[Kind, str]) -> str:
-    """Join instructions to one sentence; "hold still" without any."""
-    return ", ".join(instructions.values()) or "hold still"
+    """Return the first instruction, as people follow one at a time; "hold still" without any."""
+    return next(iter(instructions.values()), "hold still")
 
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:

@@ -1,5 +1,6 @@
 """Anti-aliased marks and text on BGR images, and their files; sizes follow the image's width."""
 
+import textwrap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +40,11 @@ BLACK: Colour = (0, 0, 0)
 FAINT: Colour = (150, 150, 150)
 MAGENTA: Colour = (235, 60, 255)
 ORANGE: Colour = (60, 160, 255)
+RED: Colour = (40, 40, 200)
 
+# Text under an image: height of a line and mean width of a letter, in widths of the image; line height for
+# cv2's font of scale 1, px.
+_LINE, _LETTER, _FONT_PX = 0.022, 0.0085, 40.0
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
 # Pictures have large even areas and thin marks: run lengths compress them as well as a search, in half the
 # time.
@@ -140,6 +145,20 @@ def draw_line(
         if casing is not None:
             cv2.polylines(picture, path, False, casing, width_px + 2, cv2.LINE_AA, _SHIFT)
         cv2.polylines(picture, path, False, colour, width_px, cv2.LINE_AA, _SHIFT)
+
+
+def with_note(picture: Picture, text: str, colour: Colour) -> Picture:
+    """Add text in white on a band of a colour under an image."""
+    line_px = _LINE * picture.shape[1]
+    lines = textwrap.wrap(text, round(1 / _LETTER))
+    band = np.empty((round((len(lines) + 0.5) * line_px), *picture.shape[1:]), dtype=np.uint8)
+    band[:] = colour
+    for k, line in enumerate(lines, start=1):
+        at, width_px = (round(0.5 * line_px), round(k * line_px)), max(1, round(line_px / 18))
+        cv2.putText(
+            band, line, at, cv2.FONT_HERSHEY_SIMPLEX, line_px / _FONT_PX, WHITE, width_px, cv2.LINE_AA
+        )
+    return np.concatenate([picture, band])
 
 
 def _fixed(pixels: Array) -> list[list[int]]:

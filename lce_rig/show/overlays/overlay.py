@@ -21,12 +21,13 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.core.results import BoardPose, BoardSurface, ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.events.figures import outline_px
+from lce_rig.judge.findings import causes_of
 from lce_rig.judge.session_check import SessionCheck
 from lce_rig.scene.outlines import Outlines
 from lce_rig.session import Capture, Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.show.overlays import canvas
-from lce_rig.show.overlays.canvas import BLACK, FAINT, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.show.overlays.canvas import BLACK, FAINT, MAGENTA, ORANGE, RED, WHITE, Picture
 from lce_rig.show.page import render
 
 PAGE = "index.html"
@@ -229,6 +230,7 @@ def draw_check(
         with suppress(SessionError):
             scans.append(scan_of(session.capture(name)))
     limits_m = range_limits(scans)
+    failure = _failure(check)
     shown = []
     for done, name in enumerate(names, start=1):
         capture = session.capture(name)
@@ -238,6 +240,8 @@ def draw_check(
             with suppress(SessionError):
                 scan, board = scan_of(capture), images.get(name)
                 picture = _draw(name, image, scan, session, check, board, limits_m)
+                if failure:
+                    picture = canvas.with_note(picture, failure, RED)
                 canvas.write_picture(folder / f"{name}.png", picture)
                 shown.append((name, "; ".join(_figures(name, check)), _cause(name, c)))
         progress(done, len(names))
@@ -267,6 +271,16 @@ def _figures(name: str, check: SessionCheck) -> Iterator[str]:
     meeting = check.meetings.get(name)
     if meeting is not None and meeting.way_m > 0:
         yield f"moved {1000 * meeting.way_m:.1f} mm"
+
+
+def _failure(check: SessionCheck) -> str:
+    """List the errors of extrinsics that failed, or that the captures contradict; "" for others."""
+    errors = [
+        finding
+        for finding in (*causes_of(check.calibration.findings), *check.findings)
+        if finding.severity == "error"
+    ]
+    return f"FAIL: {'; '.join(finding.text for finding in errors)}" if errors else ""
 
 
 def _cause(name: str, c: Calibration) -> str:

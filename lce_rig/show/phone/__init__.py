@@ -1,1 +1,1 @@
-"""A page that shows a live collection to the person who holds the board, on a phone or a big screen."""
+"""A page that shows a live collection to the person with the board, on a phone or a big screen."""

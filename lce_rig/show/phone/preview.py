@@ -21,8 +21,7 @@ DEFAULT_PORT = 8765
 
 _HINT = (
     "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080: an address of this computer "
-    "(`hostname -I` lists them, 0.0.0.0 stands for all), a free port above 1023 (`ss -ltn` lists used ones). "
-    "Give the session before it: lce-rig collect --rig R session/ --preview"
+    "(`hostname -I` lists them, 0.0.0.0 stands for all), a free port above 1023 (`ss -ltn` lists used ones)."
 )
 # linux/sockios.h; Python names neither.
 _SIOCGIFADDR = 0x8915

@@ -54,11 +54,15 @@ def test_a_top_towards_the_rig_is_nearer_to_it():
     assert np.linalg.norm(top) < np.linalg.norm(held[:3, 3]) - 0.1
 
 
-def test_at_most_three_are_said_largest_first():
+def test_instruct_place_comes_before_rotation():
     texts = words(right_m=2.0, ahead_m=2.2, up_m=0.3, tilt_deg=20.0, turn_deg=-40.0)
-    assert len(texts) == 3
     assert texts[0] == "3 steps left"
-    assert "right side" in texts[1] and "towards" in texts[1]
+    assert ["towards" in text for text in texts] == [False, False, False, True, True]
+    assert "right side" in texts[3]
+
+
+def test_say_several_moves_gives_first():
+    assert say({"sideways": "3 steps left", "tilt": "tilt the top towards the rig"}) == "3 steps left"
 
 
 def test_small_differences_are_not_mentioned():

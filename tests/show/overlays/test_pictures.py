@@ -11,7 +11,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.findings import IMAGE_TILTED
-from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, write_picture
+from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, RED, with_note, write_picture
 from lce_rig.show.overlays.debug_image import draw_debug
 from lce_rig.show.overlays.overlay import draw_overlay
 from tests.calibrate.boards import measured_plate
@@ -137,3 +137,10 @@ def test_a_picture_that_cannot_be_written_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SessionError, match=r"file.a\.png"):
         write_picture(tmp_path / "file" / "a.png", np.zeros((4, 4, 3), np.uint8))
+
+
+def test_with_note_adds_red_band_below():
+    drawn = overlay(LARGE, wall())
+    noted = with_note(drawn, "FAIL: ring ends 62 mm from the board's edges", RED)
+    assert np.array_equal(noted[: len(drawn)], drawn)
+    assert 0.6 < count(noted[len(drawn) :], RED) / noted[len(drawn) :, :, 0].size < 0.999
