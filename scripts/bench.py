@@ -63,6 +63,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "extrinsics from a scene without a board: errors, coverage, changes seen, for KITTI's views",
         lambda bench, a: bench(a.seeds or 100, a.only),
     ),
+    "scene_sim": (
+        "the same for simulated rooms and streets, three LiDARs",
+        lambda bench, a: bench(a.seeds or 15, a.only),
+    ),
     "borders": (
         "boards in scans whose border is hidden, smeared or merges with a stand, simulated",
         lambda bench, a: bench(a.captures or 50, a.only),

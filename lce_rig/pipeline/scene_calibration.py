@@ -29,8 +29,10 @@ from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording, read_pairs
 from lce_rig.io.recording import ContinuousRecording, join_recordings, read_samples, require_sensors
-from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.verdict import nominal_findings, with_findings
+from lce_rig.lens.difference import turn_of_lens
+from lce_rig.lens.models import LensPrior, model_of
 from lce_rig.pipeline.findings import (
     SCENE_AMBIGUOUS,
     SCENE_BEYOND_REACH,
@@ -46,7 +48,13 @@ from lce_rig.pipeline.findings import (
 )
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import NominalExtrinsic, Rig
-from lce_rig.scene.estimate import MIN_SCORE, SceneEstimate, estimate_scene, find_better_focal
+from lce_rig.scene.estimate import (
+    MIN_SCORE,
+    SceneEstimate,
+    estimate_scene,
+    find_better_focal,
+    follow_lens,
+)
 from lce_rig.scene.outline_score import OutlineView, build_outline_view
 from lce_rig.scene.rig_motion import estimate_motion, firing_times_s
 from lce_rig.scene.views import evenly
@@ -323,13 +331,15 @@ def calibrate_pair(
     drawn = [Drawn(camera, lidar, *each, poses) for each in zip(images, outlined, strict=True)]
     if shortage is not None:
         return shortage, drawn
+    cov, cross, cov_lens = _with_lens(rig, camera, outlined, estimate)
+    estimate = replace(estimate, cov=cov)
     names = tuple(view.capture for view in outlined)
     calibration = Calibration(
         camera=camera,
         channels=(channel or "",),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
-        cov=estimate.cov,
+        cov=cov,
         n_captures=len(views),
         n_detected=len(outlined),
         captures_used=names,
@@ -338,10 +348,29 @@ def calibrate_pair(
         certificate=Certificate(False, math.inf),
         verdict="marginal",
         method=BY_SCENE,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, estimate.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, with_lens(cov, cross, cov_lens), lens),
         intrinsics=lens,
+        intrinsics_cov=cov_lens,
+        intrinsics_cross_cov=cross,
     )
     return with_findings(calibration, list(_findings(rig, nominal, estimate, n_moving))), drawn
+
+
+def _with_lens(
+    rig: Rig, camera: str, views: Sequence[OutlineView], estimate: SceneEstimate
+) -> tuple[Array, Array, Array]:
+    """Let errors of the profile's intrinsics enter the covariance, as of a board's result.
+
+    Returns:
+        Covariance (6, 6) of the extrinsics as used with these intrinsics, their cross-covariance (6, P) with
+        the intrinsics, and the covariance (P, P) of these.
+    """
+    prior = LensPrior.read(rig.cameras[camera], rig.board)
+    cov_lens = np.asarray(np.linalg.inv(prior.of(model_of(prior.lens))[1]))
+    changes = np.linalg.cholesky((cov_lens + cov_lens.T) / 2)
+    used = follow_lens(views, prior.lens, estimate.T_cam_lidar, changes)
+    used[3:] += turn_of_lens(prior.lens) @ changes
+    return np.asarray(estimate.cov + used @ used.T), np.asarray(used @ changes.T), cov_lens
 
 
 def _at_image(rig: Rig, view: View, image: Image, scan: Scan, built: OutlineView) -> OutlineView | None:

@@ -39,19 +39,33 @@ class EdgeLayer:
 
     def sample(self, pixels: Array) -> Array:
         """Interpolate value and derivatives (N, 3) at pixels (N, 2) of the image; 0 outside."""
-        if not len(pixels):
-            return np.zeros((0, 3))
-        at = ((np.where(np.isfinite(pixels), pixels, -1e4) + 0.5) / self.reduction - 0.5).astype(np.float32)
-        at = np.clip(at, -1e4, 3e4)
-        rows = max(1, -(-len(at) // _REMAP_COLUMNS))
-        padded = np.full((rows * _REMAP_COLUMNS, 2), -1e4, dtype=np.float32)
-        padded[: len(at)] = at
-        grid = padded.reshape(rows, _REMAP_COLUMNS, 2)
-        sampled = cv2.remap(self.values, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderValue=(0.0,) * 4)
-        return np.asarray(sampled.reshape(-1, 3)[: len(at)], dtype=np.float64)
+        at = places(pixels, self.reduction)
+        parts = [
+            self.interpolate(at[:, k : k + _REMAP_COLUMNS]) for k in range(0, len(pixels), _REMAP_COLUMNS)
+        ]
+        return np.concatenate([np.zeros((0, 3)), *parts])
+
+    def interpolate(self, at: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Interpolate value and derivatives (N, 3), N at most 32767, at `places` (2, N); 0 outside."""
+        if not at.size:
+            return np.zeros((0, 3), dtype=np.float32)
+        sampled = cv2.remap(self.values, at[:1], at[1:], cv2.INTER_LINEAR, borderValue=(0.0,) * 4)
+        return np.asarray(sampled[0])
 
 
-_REMAP_COLUMNS = 1024  # OpenCV limits a row of samples to 32767.
+def places(pixels: Array, reduction: int | NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return the places (2, N) of an image's pixels (N, 2) in its fields; far outside where NaN.
+
+    Args:
+        pixels: of the image.
+        reduction: of the field, or of each pixel's field (N,).
+    """
+    at = (pixels.T + 0.5) / reduction - 0.5
+    return np.asarray(np.fmin(np.fmax(at, _FAR_OUTSIDE), -_FAR_OUTSIDE), dtype=np.float32, order="C")
+
+
+_REMAP_COLUMNS = 32767  # OpenCV's largest row of samples.
+_FAR_OUTSIDE = -1e4  # px; OpenCV's coordinates have 16 bits.
 
 
 @dataclass(frozen=True, eq=False)

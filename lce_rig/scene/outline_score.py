@@ -10,7 +10,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, perturb, skew, transform
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid, build_event_pyramid
+from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid, build_event_pyramid, places
 from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outlines
 
 _BESIDE_RAD = 0.06  # Margin of the image in which outlines are kept: other extrinsics bring them in.
@@ -76,7 +76,8 @@ class OutlineScore:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         order = [np.argsort(view.outlines.kind == LEVEL, kind="stable") for view in views]
         outlines = [view.outlines.select(each) for view, each in zip(views, order, strict=True)]
-        self._points = np.concatenate([each.points for each in outlines])
+        # Coordinates one behind the other: numpy takes them apart faster.
+        self._points = np.concatenate([each.points for each in outlines]).T.copy().T
         weight = np.concatenate([each.weight for each in outlines])
         self._weight = weight / max(weight.sum(), 1e-12)
         self._kind = np.concatenate([each.kind for each in outlines])
@@ -89,6 +90,8 @@ class OutlineScore:
             for k, view in enumerate(views)
             for axis, layer in enumerate(view.pyramid.levels[level])
         ]
+        counts_of_layers = [chosen.stop - chosen.start for _, chosen in self._layers]
+        self._reduction = np.repeat([layer.reduction for layer, _ in self._layers], counts_of_layers)
 
     def __len__(self) -> int:
         return len(self._points)
@@ -100,26 +103,33 @@ class OutlineScore:
             Shares (N,) of the score; their derivatives (N, 6) by a further tangent; pixels (N, 2).
         """
         T = perturb(self.T_cam_lidar, tangent)
-        at_camera = transform(T, self._points)
+        at_camera = self._at_camera(T)
         pixels, is_valid = self._intrinsics.project(at_camera)
-        sampled = np.empty((len(pixels), 3))
-        for layer, chosen in self._layers:
-            sampled[chosen] = layer.sample(pixels[chosen])
-        sampled[~is_valid] = 0.0
-        sampled *= self._weight[:, None]
+        sampled = self._sample(pixels) * self._weight[:, None]
         by_point = np.einsum("ni,nij->nj", sampled[:, 1:], self._slopes(at_camera, is_valid))
-        by_turn = np.cross(at_camera - T[:3, 3], by_point)
-        return sampled[:, 0], np.concatenate([by_point, by_turn], axis=1), pixels
+        x, y, z = (at_camera - T[:3, 3]).T
+        u, v, w = by_point.T
+        slopes = np.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+        return sampled[:, 0], slopes, pixels
+
+    def _at_camera(self, T_cam_lidar: Array) -> Array:
+        """Transform all points as `transform` does, keeping their layout in memory."""
+        return np.asarray((T_cam_lidar[:3, :3] @ self._points.T + T_cam_lidar[:3, 3:]).T)
+
+    def _sample(self, pixels: Array) -> Array:
+        """Interpolate the fields and their derivatives (N, 3) at pixels (N, 2); 0 outside and where NaN."""
+        at = places(pixels, self._reduction)
+        return np.concatenate([layer.interpolate(at[:, chosen]) for layer, chosen in self._layers])
 
     def _slopes(self, at_camera: Array, is_valid: NDArray[np.bool_]) -> Array:
-        slopes = self._intrinsics.differentiate(np.where(is_valid[:, None], at_camera, [0.0, 0.0, 1.0]))
-        return np.asarray(slopes)
+        if not is_valid.all():
+            at_camera = np.where(is_valid[:, None], at_camera, [0.0, 0.0, 1.0])
+        return self._intrinsics.differentiate(at_camera)
 
     def value(self, tangent: Array) -> float:
         """Score extrinsics moved by a tangent (6,)."""
-        pixels, _ = self._intrinsics.project(transform(perturb(self.T_cam_lidar, tangent), self._points))
-        sampled = [layer.sample(pixels[chosen])[:, 0] for layer, chosen in self._layers]
-        return float(self._weight @ np.concatenate(sampled))
+        pixels, _ = self._intrinsics.project(self._at_camera(perturb(self.T_cam_lidar, tangent)))
+        return float(self._weight @ self._sample(pixels)[:, 0])
 
     def score(self, tangent: Array) -> tuple[float, Array]:
         """Score extrinsics moved by a tangent (6,), with the derivative (6,) by that tangent."""

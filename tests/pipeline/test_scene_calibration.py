@@ -12,6 +12,7 @@ from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.scene_calibration import calibrate_scene
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.session import Session
@@ -210,3 +211,11 @@ def test_session_of_a_board_is_refused(drive, panels, tmp_path):
 def test_recording_without_profile_is_refused(drive, tmp_path):
     with pytest.raises(SessionError, match="not a session"):
         calibrate_scene([drive], tmp_path / "out")
+
+
+def test_calibrate_scene_keeps_lens_errors(panels, tmp_path):
+    path = session_of(tmp_path / "session", panels)
+    (found,) = calibrate_scene([path], path).result.pairs
+    alone_rad, used_rad = (np.sqrt(np.diag(cov)[3:]) for cov in (covariance_alone(found), found.cov))
+    # A rotation by the profile's principal point, 0.4 % of the focal length, takes the place of its error.
+    assert np.all(alone_rad[:2] > 0.7 * 0.004) and np.all(used_rad[:2] < 0.7 * alone_rad[:2])

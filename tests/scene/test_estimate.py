@@ -7,14 +7,17 @@ import pytest
 
 from lce_rig.core.geometry import difference, perturb, tangent_sizes
 from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.lens.difference import turn_of_lens
+from lce_rig.lens.models import MODELS
 from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
-from lce_rig.scene.estimate import REACH, estimate_scene, find_better_focal
+from lce_rig.scene.estimate import REACH, estimate_scene, find_better_focal, follow_lens
 from lce_rig.scene.outline_score import OutlineScore, build_outline_view
 from lce_rig.scene.outlines import LEVEL, UPRIGHT, find_outlines
 from tests.scene.conftest import COV
 from tests.scene.panels import LENS, TRUTH, rendered
 
 BEAM = Beam(0.0, 0.0)
+VECTOR = MODELS["radtan4"].vector(LENS)
 
 
 def outline_view(seed):
@@ -144,3 +147,20 @@ def test_better_focal_finds_wrong_lens(views, scale, sign):
     lens = replace(LENS, fx_px=scale * LENS.fx_px, fy_px=scale * LENS.fy_px)
     found = estimate_scene(views, lens, TRUTH)
     assert np.sign(find_better_focal(views, lens, found.T_cam_lidar) or 0) == sign
+
+
+@pytest.mark.parametrize("change", [(0, 0, 6, 0), (0, 0, 0, -6), (4, 4, 0, 0)])
+def test_follow_lens_foretells_another_estimate(views, change):
+    change = np.array([*change, 0, 0, 0, 0], dtype=np.float64)
+    found, lens = estimate(views), MODELS["radtan4"].intrinsics(VECTOR + change, 640, 360)
+    other = estimate_scene(views, lens, TRUTH)
+    moved = difference(other.T_cam_lidar, found.T_cam_lidar)
+    (foretold,) = follow_lens(views, LENS, found.T_cam_lidar, change[:, None]).T
+    far = [1, 1, 1, 5, 5, 5] * (moved - foretold)
+    assert np.linalg.norm(far) < 0.3 * np.linalg.norm([1, 1, 1, 5, 5, 5] * moved)
+
+
+def test_follow_lens_turns_by_principal_point(views):
+    changes = np.eye(8)[:, 2:4]
+    moved = follow_lens(views, LENS, TRUTH, changes)[3:] + turn_of_lens(LENS) @ changes
+    assert np.linalg.norm(moved, axis=0).max() < 0.3 / LENS.fx_px
