@@ -283,21 +283,20 @@ def _moved(finding: Finding) -> str:
     """The {place} {n_captures} captures, {captures}, fit a mounting {rotation_deg}, {translation_m} apart.
 
     {neighbour} lies before or after them; {chance}: to differ as much on one mounting; {sensor} moved, where
-    others show that it did.
+    others show that it did, even if no capture of this pair does.
     """
-    place = finding.figures["place"]
-    one = (
-        "{captures:few} fits"
-        if finding.figures["n_captures"] == 1
-        else "{n_captures} captures ({captures:few}) fit"
-    )
-    text = fill(one + " a mounting changed by " + _APART, finding.figures)
+    place, n = finding.figures["place"], finding.figure("n_captures")
+    changed = fill("a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
     cameras = f"{finding.subject} in their images: " if finding.subject else ""
-    which = f"the {place} " if place and finding.figures["n_captures"] != 1 else ""
-    which = which or ("capture " if finding.figures["n_captures"] == 1 else "")
+    which = f"the {place} " if place else ""
+    captures = fill("{n_captures} captures ({captures:few}) fit", finding.figures)
+    if n == 1:
+        which, captures = "", fill("capture {captures:few} fits", finding.figures)
+    elif n == 0:
+        which, captures = "", "no capture shows"
     sensor = finding.figures.get("sensor") or "a sensor"
-    return f"{cameras}{which}{text}: {sensor} moved {fill(when, finding.figures)}"
+    return f"{cameras}{which}{captures} {changed}: {sensor} moved {fill(when, finding.figures)}"
 
 
 def _agree(finding: Finding) -> str:
