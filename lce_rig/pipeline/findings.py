@@ -187,6 +187,13 @@ SCENE_UNCERTAIN = Kind(
     "record more places, or calibrate with a board",
     severity="warning",
 )
+SCENE_ONE_PLACE = Kind(
+    "scene_calibration.one_place",
+    "{n_views} views show one place, where a wrong pose may fit: images correlate by {alike:.2f} "
+    "(limit {limit:.2f})",
+    "record several places",
+    severity="warning",
+)
 SCENE_TYPICAL = Kind(
     "scene_calibration.typical",
     "nothing confirms the result: nominal_extrinsics is typical of such rigs, not of this one",

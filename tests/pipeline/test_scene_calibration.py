@@ -140,6 +140,12 @@ def verdict_of(panels, tmp_path, rig):
     return c.verdict, {finding.code for finding in c.findings if finding.severity != "note"}
 
 
+def test_views_of_one_place_do_not_pass(panels, tmp_path):
+    rig = rig_of(nominal(perturb(TRUTH, OFF)), target_sigma_m=0.2, target_sigma_deg=2.0)
+    verdict, codes = verdict_of([panels[0]] * 3, tmp_path, rig)
+    assert verdict == "marginal" and codes == {"scene_calibration.one_place"}
+
+
 def test_wide_targets_pass_with_cad(panels, tmp_path):
     rig = rig_of(nominal(perturb(TRUTH, OFF)), target_sigma_m=0.2, target_sigma_deg=2.0)
     assert verdict_of(panels, tmp_path, rig) == ("pass", set())
