@@ -15,6 +15,8 @@ from lce_rig.show.phone.preview import Preview
 from .conftest import PRESENT_PX, picture, port_of, state
 from .watcher import Watcher
 
+pytestmark = pytest.mark.realtime
+
 
 def ask_for_states(port, query):
     return (
@@ -85,7 +87,7 @@ def test_feed_stuck_page_delays_nothing(preview):
             time.sleep(0.01)
         while shown < 39:
             shown = quick.next_state()[0]["n_captures"]
-        assert statistics.median(took_s) < 1e-3
+        assert statistics.median(took_s) < 10e-3
         got = stuck.receive_all(quiet_s=0.5)
         assert sum(isinstance(message, dict) for message in got) <= 1
 
@@ -98,7 +100,7 @@ def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
         assert preview.asked() is None
         for name in ("000006", "000005"):
             watcher.send(json.dumps({"take_back": name}))
-        deadline_s, asked = time.monotonic() + 20, list[str]()
+        deadline_s, asked = time.monotonic() + 60, list[str]()
         while len(asked) < 2:
             assert time.monotonic() < deadline_s
             if (each := preview.asked()) is not None:
@@ -153,8 +155,8 @@ def test_pages_have_the_last_state_when_the_collection_ends():
         preview.publish(state(phase="ended", n_captures=9))
         closer = threading.Thread(target=preview.close)
         closer.start()
-        seen = [json.dumps(message) for message in watcher.receive_all(3.0) if isinstance(message, dict)]
-        closer.join(5)
+        seen = [json.dumps(message) for message in watcher.receive_all(30.0) if isinstance(message, dict)]
+        closer.join(60)
         assert not closer.is_alive()
     assert '"phase": "ended"' in seen[-1]
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]
