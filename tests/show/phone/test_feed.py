@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.show.phone.pages import MAX_WIDTH_PX, encode_picture
 from lce_rig.show.phone.preview import Preview
 
 from .conftest import PRESENT_PX, picture, port_of, state
@@ -51,24 +50,6 @@ def test_all_of_a_state_arrives(preview):
     assert jpeg is not None
     decoded = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(decoded.astype(int) - picture()).mean() < 1
-
-
-@pytest.mark.parametrize(
-    ("shape", "size"),
-    [
-        ((720, 1280), (540, 960)),
-        ((260, 346), (260, 346)),
-        ((2048, 2448, 3), (683, 816)),
-        ((1, 5000), (1, 833)),
-    ],
-)
-def test_pictures_are_made_small_enough_for_a_phone(shape, size):
-    pixels = np.zeros(shape, np.uint8)
-    pixels[: shape[0] // 2] = 200
-    decoded = cv2.imdecode(np.frombuffer(encode_picture(pixels), np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert decoded.shape == size
-    assert decoded.shape[1] <= MAX_WIDTH_PX
-    assert abs(decoded.mean() - pixels.mean()) < 2
 
 
 def test_feed_stuck_page_delays_nothing(preview):
