@@ -92,6 +92,7 @@ def test_explain_one_error_is_named_alone(change, cause, method):
     assert causes(change(observed(16, 3)), method) == [cause]
 
 
+@pytest.mark.long
 def test_explain_two_boards_are_named():
     observations = observed(16, 3)
     smaller = squares(0.9)(observations[8:])
@@ -122,6 +123,7 @@ def test_explain_range_offset_tells_size():
     assert found.after.state.lasers[0].mean() == pytest.approx(0.06, abs=0.012)
 
 
+@pytest.mark.long
 def test_explain_scattered_images_is_no_moved_sensor():
     rng = np.random.default_rng(0)
     scattered = [
@@ -139,6 +141,7 @@ def test_explain_level_of_noise_does_not_hide_a_move():
     assert found.gain.log10_chance < -6
 
 
+@pytest.mark.long
 def test_table_chances_of_sound_captures_are_uniform():
     """A tenth of the chances of an error that is not there lies below a tenth."""
     chances = []

@@ -96,6 +96,7 @@ def test_the_last_capture_alone_is_named() -> None:
     assert finding.figures["capture"] == "000014"
 
 
+@pytest.mark.long
 def test_lone_outliers_are_no_moved_sensor() -> None:
     rng = np.random.default_rng(5)
     for seed in range(4):

@@ -46,7 +46,7 @@ def test_four_sensors_loops_close(sound):
         assert np.allclose(closed, T[camera, "rear"], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["right", "rear"])
+@pytest.mark.parametrize("name", ["right", pytest.param("rear", marks=pytest.mark.long)])
 def test_sensor_that_moved_is_named_and_others_pass(name):
     after = perturb(ON_FRONT[name], np.r_[0.01, 0.0, 0.01, np.radians([0.6, 0.0, 0.8])])
     moves = {name: lambda k: ON_FRONT[name] if k < N // 2 else after}
