@@ -42,7 +42,8 @@ def test_require_file_too_large_is_refused_by_size(tmp_path):
     ("pack", "make"),
     [(bz2.compress, bz2.BZ2Decompressor), (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor)],
 )
-def test_unpack_gives_all_frames_up_to_the_bound(pack, make):
+def test_unpack_gives_all_frames_up_to_the_bound(pack, make, monkeypatch):
+    monkeypatch.setattr("lce_rig.core.bounds._STEP_BYTES", 1 << 20)
     plain = bytes(range(256)) * 10_000
     packed = pack(plain)
     assert unpack(make, packed) == plain
