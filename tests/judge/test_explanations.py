@@ -109,7 +109,10 @@ def test_explain_drift_is_named():
     assert causes(observations)[0] in ("drift", "moved")
 
 
-@pytest.mark.parametrize(("angle_deg", "first"), [(0.8, 8), (3.0, 13), (5.0, 2)])
+@pytest.mark.parametrize(
+    ("angle_deg", "first"),
+    [(0.8, 8), pytest.param(3.0, 13, marks=pytest.mark.long), pytest.param(5.0, 2, marks=pytest.mark.long)],
+)
 def test_explain_moved_tells_size_and_capture(angle_deg, first):
     found, *_ = explained(
         moved(observed(16, 4), lambda k: k >= first, [0, 0, 0, np.radians(angle_deg), 0, 0])
