@@ -64,7 +64,7 @@ def half_size(rig):
     return rig
 
 
-def wait_until(is_so, patience_s=20.0):
+def wait_until(is_so, patience_s=120.0):
     """Wait until something is so; a busy computer takes long."""
     deadline_s = time.monotonic() + patience_s
     while not is_so():

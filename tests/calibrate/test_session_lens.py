@@ -47,6 +47,7 @@ def test_session_lens_matches_true_lens(captures, errors):
     assert lens.estimate.is_contradicted == (abs(errors[0]) > 0.01)
 
 
+@pytest.mark.long
 def test_session_lens_rarely_contradicts(captures):
     contradicted = 0
     for errors in np.random.default_rng(0).normal(size=(12, 4)) * (0.004, 3.6, 3.6, 2.2):

@@ -157,15 +157,18 @@ def _typed(command):
             value = "other" if word == "OTHER_SESSION" else "session"
         typed.append(value)
     if typed[0] == "collect" and "--from" not in typed:
-        typed += ["--simulated", "--plain", "--captures", "1", "--timeout", "60"]
+        typed += ["--simulated", "--plain", "--captures", "1", "--timeout", "240"]
     if first == "rigs new" and len(typed) == 3:
         typed += ["--from", "rlfs"]
     return tuple(typed)
 
 
-TYPED = sorted(
-    {_typed(command) for _, command in ADVISED if not command.startswith((*PARSED_ONLY, "fleet run"))}
-)
+TYPED = [
+    pytest.param(words, marks=pytest.mark.realtime if "--simulated" in words else ())
+    for words in sorted(
+        {_typed(command) for _, command in ADVISED if not command.startswith((*PARSED_ONLY, "fleet run"))}
+    )
+]
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ def test_options_of_the_other_kind_are_refused_by_name(lce_rig, tmp_path, argume
     assert not (tmp_path / "session").exists()
 
 
+@pytest.mark.realtime
 def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path):
     result = lce_rig("collect", "--rig", "rlfs", tmp_path / "session", "--plain", "--timeout", "5")
     assert result.code == 5
@@ -86,6 +87,7 @@ def start(path, *arguments, rig="rles", **options):
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "pair"),
@@ -95,7 +97,7 @@ def start(path, *arguments, rig="rles", **options):
 def test_collect_simulated_writes_truth(tmp_path, rig, pair):
     path = tmp_path / "session"
     process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3", rig=rig)
-    _, said = process.communicate(timeout=300)
+    _, said = process.communicate(timeout=400)
     assert process.returncode == 0, said
     session = Session.open(path)
     assert len(session.captures) == 2
@@ -108,6 +110,7 @@ def test_collect_simulated_writes_truth(tmp_path, rig, pair):
     assert "2 captures (2 new)" in said and "holding:" in said
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_collect_killed_early_no_traceback(tmp_path):
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -115,10 +118,11 @@ def test_collect_killed_early_no_traceback(tmp_path):
         assert "starting" in process.stderr.readline()
         time.sleep(0.5)
         os.killpg(process.pid, number)  # as a terminal does: to the simulation, too
-        _, said = process.communicate(timeout=60)  # until the simulation has closed its end, too
+        _, said = process.communicate(timeout=180)  # until the simulation has closed its end, too
         assert process.returncode in (130, -number) and "Traceback" not in said
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
 def test_collect_closed_terminal_stops(tmp_path, term):
@@ -130,7 +134,7 @@ def test_collect_closed_terminal_stops(tmp_path, term):
         command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, start_new_session=True
     )
     os.close(theirs)
-    said, deadline_s = b"", time.monotonic() + 150
+    said, deadline_s = b"", time.monotonic() + 300
     try:
         while b"davis.frames" not in said and b"moving" not in said:
             assert time.monotonic() < deadline_s and process.poll() is None, said
@@ -138,7 +142,7 @@ def test_collect_closed_terminal_stops(tmp_path, term):
                 said += os.read(ours, 65536)
         os.close(ours)
         process.send_signal(signal.SIGHUP)  # as the kernel does where it is the controlling terminal
-        process.wait(timeout=60)
+        process.wait(timeout=180)
     finally:
         process.kill()
     assert (b"\x1b[" in said) == (term == "xterm")
@@ -146,6 +150,7 @@ def test_collect_closed_terminal_stops(tmp_path, term):
     assert entries[-1]["event"] == "collected live" and entries[-1]["ending"] == "stopped"
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_collect_unattended_run_exits_with_6(lce_rig, tmp_path, monkeypatch):
     monkeypatch.setattr("lce_rig.cli.collect_live.SIMULATED_IDLE_S", 15.0)

@@ -13,6 +13,8 @@ from tests.doctor.attached import PIXELS, SCAN, Attached, attach
 from tests.doctor.observed import make_rig
 from tests.shared import has_ended, wait_until
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def absent(tmp_path):
@@ -78,6 +80,6 @@ def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
         with subprocess.Popen([sys.executable, "-m", "lce_rig", *words], stderr=subprocess.PIPE) as process:
             wait_until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
             process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 130
+            assert process.wait(60) == 130
         pid = (tmp_path / "pid").read_text()
         wait_until(lambda: has_ended(pid))

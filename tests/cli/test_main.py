@@ -78,6 +78,7 @@ sys.exit(run(words))
 """
 
 
+@pytest.mark.realtime
 def test_main_interrupt_in_open3d_exits_130(tmp_path):
     # Stopped in its initialisation, it would complain of lost memory and end the process with 1.
     words = ["open3d.pybind", "0.2", "simulate", "--rig", "rles", tmp_path / "session", "--captures", "1"]
@@ -86,6 +87,7 @@ def test_main_interrupt_in_open3d_exits_130(tmp_path):
     assert len(done.stderr.split("\n")) == 3 and done.stderr.startswith("\ninterrupted")
 
 
+@pytest.mark.realtime
 def test_main_interrupt_in_onnx_exits_130(tmp_path):
     words = ["onnxruntime.capi.onnxruntime_pybind11_state", "0.01", "reconstruct", "none", "-o", tmp_path]
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)

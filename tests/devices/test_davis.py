@@ -199,6 +199,7 @@ def over_network(port):
     return lambda sensor, settings: OpenedCamera(dv.io.NetworkReader("127.0.0.1", port), "a sender")
 
 
+@pytest.mark.realtime
 def test_davis_live_lost_sender_is_an_error():
     """Until then events arrive with a delay of less than 500 ms."""
     with (
@@ -218,6 +219,7 @@ def test_davis_live_lost_sender_is_an_error():
     assert "unplugged" in caught.value.hint
 
 
+@pytest.mark.realtime
 def test_a_stream_that_the_profile_wants_must_be_there():
     with sender(1) as (_, port):
         source = DavisSource("davis", camera(), over_network(port))

@@ -18,7 +18,7 @@ def test_disk_writer_keeps_order_unwaited():
     written, may_go = [], threading.Event()
 
     def write(item):
-        may_go.wait(10)
+        may_go.wait(60)
         written.append(item)
 
     with DiskWriter(HERE, write, lambda: written.append("finished")) as disk:
@@ -33,11 +33,18 @@ def test_disk_writer_keeps_order_unwaited():
 
 
 def test_disk_writer_slow_disk_drops_counted(tmp_path):
-    path = tmp_path / "raw"
-    with path.open("wb") as file, DiskWriter(path, file.write, most_waiting_bytes=100_000) as disk:
-        for _ in range(40_000):
-            disk.put(bytes(1206), 1206)
-    assert disk.n_written + disk.n_dropped == 40_000 and disk.n_dropped > 0
+    path, may_go = tmp_path / "raw", threading.Event()
+    with path.open("wb") as file:
+
+        def write(item):
+            may_go.wait(60)
+            file.write(item)
+
+        with DiskWriter(path, write, most_waiting_bytes=100_000) as disk:
+            for _ in range(1000):
+                disk.put(bytes(1206), 1206)
+            may_go.set()
+    assert disk.n_written + disk.n_dropped == 1000 and disk.n_dropped > 900
     assert path.stat().st_size == disk.n_written * 1206
     (finding,) = disk.findings()
     assert (finding.code, finding.figures["n"]) == ("device.recording_incomplete", disk.n_dropped)

@@ -15,6 +15,7 @@ from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 from tests.shared import has_ended, wait_until
 
+pytestmark = pytest.mark.realtime
 WIDTH, HEIGHT = 32, 18
 
 

@@ -22,7 +22,7 @@ def pulse(count):
 class Script(LiveSource):
     """A device that gives what it was told to, one entry a call; an error is raised; then nothing."""
 
-    def __init__(self, *entries, name="s", n_slots=9, silence_s=5.0):
+    def __init__(self, *entries, name="s", n_slots=9, silence_s=60.0):
         super().__init__(name, f"sensor {name!r}", silence_s, HINT, n_slots)
         self.entries = list(entries)
         self.is_open = False
@@ -93,7 +93,7 @@ def test_reading_failed_sensor_is_reopened():
     lossy = Script([pulse(0)], SourceError("gone"), [pulse(1)])
     steady = Script(*[[pulse(k)] for k in range(5)], name="t")
     with AttachedSensors([lossy, steady], reopen_every_s=0.05) as sensors:
-        came = [each for each in (sensors.take(5.0) for _ in range(7)) if each is not None]
+        came = [each for each in (sensors.take(60.0) for _ in range(7)) if each is not None]
         by_name = {
             name: [each.count for key, each in came if key == name and isinstance(each, Pulse)]
             for name in "st"
@@ -111,7 +111,7 @@ def test_attach_early_overflow_is_no_loss():
 
     early, late = Script([pulse(k) for k in range(100)], n_slots=64), Slow([pulse(0)], name="t")
     with AttachedSensors([early, late]) as sensors:
-        assert sensors.take(5.0) == ("s", pulse(36))  # the newest 64 of 100
+        assert sensors.take(60.0) == ("s", pulse(36))  # the newest 64 of 100
         assert sensors.statuses()["s"].n_dropped == 0
 
 

@@ -11,6 +11,8 @@ from lce_rig.rig.profile import SyncSettings
 from tests.devices.attached import attached
 from tests.shared import wait_until
 
+pytestmark = pytest.mark.realtime
+
 
 def settings(path, **more):
     triggers = {"cam": {"channel": 0, "rate_hz": 100.0}}
@@ -133,7 +135,7 @@ def test_a_silent_board_is_an_error_with_what_to_check():
         with pytest.raises(SourceError, match=r"0\.3 s") as caught:
             attached(SyncBoard(settings(fake.path), hello_s=0.3)).__enter__()
         assert "firmware" in caught.value.hint
-        assert "LCEHI?" in fake.commands
+        wait_until(lambda: "LCEHI?" in fake.commands)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +143,7 @@ def test_a_silent_board_is_an_error_with_what_to_check():
 )
 def test_a_board_that_talks_otherwise_is_refused(hello, named):
     with FakeBoard(hello=hello) as fake, pytest.raises(SourceError, match=named):
-        attached(SyncBoard(settings(fake.path), hello_s=0.3)).__enter__()
+        attached(SyncBoard(settings(fake.path), hello_s=3.0)).__enter__()
 
 
 def test_a_port_that_is_absent_busy_or_no_port_says_so(tmp_path):

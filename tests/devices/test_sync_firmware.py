@@ -231,6 +231,7 @@ def running(host_board):
     os.close(slave)
 
 
+@pytest.mark.realtime
 def test_firmware_works_with_live_source(running):
     given = {"device": running.path, "triggers": {"cam": {"channel": 1, "rate_hz": 50.0, "phase_us": 3000}}}
     with attached(SyncBoard(SyncSettings.model_validate(given))) as (board, samples):
@@ -252,6 +253,7 @@ def test_firmware_works_with_live_source(running):
     assert not codes & {"stream.damaged_lines", "device.board_error", "device.board_restarted"}
 
 
+@pytest.mark.realtime
 def test_firmware_survives_input_noise(running):
     """A computer that does not read costs lines only."""
     descriptor = os.open(running.path, os.O_RDWR | os.O_NOCTTY)

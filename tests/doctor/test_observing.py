@@ -12,6 +12,8 @@ from lce_rig.doctor.observing import observe
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import SyncSettings
 
+pytestmark = pytest.mark.realtime
+
 
 class Unusable(LiveSource):
     """A sensor that cannot be opened."""
@@ -65,7 +67,7 @@ def test_observe_failure_keeps_other_sensors():
 def test_where_nothing_opens_nothing_is_waited_for():
     start_s = time.monotonic()
     seen = observe([ABSENT], 60.0)
-    assert time.monotonic() - start_s < 10 and seen["gone"].status is None
+    assert time.monotonic() - start_s < 30 and seen["gone"].status is None
 
 
 def test_a_davis_over_the_network_has_its_events_counted(tmp_path):

@@ -307,6 +307,7 @@ def test_deploy_link_to_device_is_replaced(result, rig, target, robot):
         rollback(target)
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_the_output_and_the_time_of_a_command_are_bounded(result, rig, target):
     endless = with_settings(target, run="yes", run_timeout_s=2)

@@ -45,7 +45,7 @@ def _acts(tmp_path_factory):
     os.environ["PYTHONPATH"] = before
 
 
-def act(name, limit_s=60.0, limit_mb=1000.0):
+def act(name, limit_s=600.0, limit_mb=1000.0):
     return run_apart(f"acts_of_sessions:{name}", {"robot": "r1"}, limit_s, limit_mb)
 
 
@@ -55,12 +55,13 @@ def test_a_session_returns_its_rows():
     assert (done.known, done.status, done.cause) == ({"robot": "r1"}, "ok", None)
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_one_that_hangs_is_ended_at_its_time_limit():
     start_s = time.monotonic()
     ended = act("hang", limit_s=8.0)
     assert (ended.rows, ended.status, ended.known) == (None, "timed_out", {"robot": "r1"})
-    assert time.monotonic() - start_s < 30
+    assert time.monotonic() - start_s < 50
 
 
 @pytest.mark.parametrize("way", ["gulp", pytest.param("eat", marks=pytest.mark.long)])
@@ -83,16 +84,16 @@ def test_the_session_ends_with_whoever_started_it(tmp_path):
         "import os, pathlib, time\n"
         "def hang(arguments, tell):\n"
         "    pathlib.Path(arguments['file']).write_text(str(os.getpid()))\n"
-        "    time.sleep(60)\n"
+        "    time.sleep(600)\n"
     )
     pid_file = tmp_path / "pid"
     script = (
         "from lce_rig.fleet.work import run_apart\n"
-        f"run_apart('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 60, 4000)\n"
+        f"run_apart('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 600, 4000)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     worker = subprocess.Popen([sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": path})
-    wait_until(lambda: pid_file.exists() and pid_file.read_text(), 60)
+    wait_until(lambda: pid_file.exists() and pid_file.read_text())
     worker.kill()
     worker.wait()
-    wait_until(lambda: has_ended(pid_file.read_text()), 60)
+    wait_until(lambda: has_ended(pid_file.read_text()))

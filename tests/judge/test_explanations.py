@@ -92,6 +92,7 @@ def test_explain_one_error_is_named_alone(change, cause, method):
     assert causes(change(observed(16, 3)), method) == [cause]
 
 
+@pytest.mark.long
 def test_explain_two_boards_are_named():
     observations = observed(16, 3)
     smaller = squares(0.9)(observations[8:])
@@ -108,7 +109,10 @@ def test_explain_drift_is_named():
     assert causes(observations)[0] in ("drift", "moved")
 
 
-@pytest.mark.parametrize(("angle_deg", "first"), [(0.8, 8), (3.0, 13), (5.0, 2)])
+@pytest.mark.parametrize(
+    ("angle_deg", "first"),
+    [(0.8, 8), pytest.param(3.0, 13, marks=pytest.mark.long), pytest.param(5.0, 2, marks=pytest.mark.long)],
+)
 def test_explain_moved_tells_size_and_capture(angle_deg, first):
     found, *_ = explained(
         moved(observed(16, 4), lambda k: k >= first, [0, 0, 0, np.radians(angle_deg), 0, 0])
@@ -122,6 +126,7 @@ def test_explain_range_offset_tells_size():
     assert found.after.state.lasers[0].mean() == pytest.approx(0.06, abs=0.012)
 
 
+@pytest.mark.long
 def test_explain_scattered_images_is_no_moved_sensor():
     rng = np.random.default_rng(0)
     scattered = [
@@ -139,6 +144,7 @@ def test_explain_level_of_noise_does_not_hide_a_move():
     assert found.gain.log10_chance < -6
 
 
+@pytest.mark.long
 def test_table_chances_of_sound_captures_are_uniform():
     """A tenth of the chances of an error that is not there lies below a tenth."""
     chances = []

@@ -61,7 +61,7 @@ def calibrated(boards: list[Observation]) -> Calibration:
 
 
 @pytest.mark.parametrize("angle_deg", [1.5, 3.0, 5.0])
-@pytest.mark.parametrize("n_moved", [2, 3])
+@pytest.mark.parametrize("n_moved", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_a_sensor_that_moved_before_the_last_captures_fails(n_moved: int, angle_deg: float) -> None:
     calibration = calibrated(moved(simulate(15, 2), range(15 - n_moved, 15), turned(angle_deg)))
     first = calibration.findings[0]
@@ -96,6 +96,7 @@ def test_the_last_capture_alone_is_named() -> None:
     assert finding.figures["capture"] == "000014"
 
 
+@pytest.mark.long
 def test_lone_outliers_are_no_moved_sensor() -> None:
     rng = np.random.default_rng(5)
     for seed in range(4):

@@ -10,6 +10,7 @@ from lce_rig.doctor.checks import Check, examine
 from tests.doctor.attached import PIXELS, SCAN, Attached, attach
 from tests.doctor.observed import codes, make_rig
 
+pytestmark = pytest.mark.realtime
 Lines = dict[tuple[str, str], Check]
 
 

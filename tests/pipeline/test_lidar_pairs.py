@@ -73,6 +73,7 @@ def codes(result):
     return {finding.code for finding in result.findings if finding.severity != "note"}
 
 
+@pytest.mark.long
 def test_lidar_pairs_pose_fits_covariance():
     rig, chi2 = make_rig(), []
     for seed in range(4):
@@ -110,7 +111,10 @@ def test_without_a_nominal_pose_alike_lidars_never_pass():
     assert not codes(calibrate(rig, scan_both(14, 1, rig.board.to_board())))
 
 
-@pytest.mark.parametrize(("n_moved", "turn_deg"), [(7, 1.0), (4, 2.0), (2, 3.0)])
+@pytest.mark.parametrize(
+    ("n_moved", "turn_deg"),
+    [pytest.param(7, 1.0, marks=pytest.mark.long), pytest.param(4, 2.0, marks=pytest.mark.long), (2, 3.0)],
+)
 def test_a_lidar_that_moved_between_captures_never_passes(n_moved, turn_deg):
     rig = make_rig()
     move = np.r_[0.01, 0, 0.02, np.radians([0.0, 0.6 * turn_deg, 0.8 * turn_deg])]

@@ -102,6 +102,7 @@ def test_folder_gives_result_exports_and_overlays(drive, tmp_path, capsys):
     assert len(pictures) == 3 and cv2.imread(str(pictures[0])) is not None
 
 
+@pytest.mark.long
 def test_verify_without_board_advises_drift(drive, tmp_path, capsys):
     words = [str(word) for word in ("--scene", drive, "--rig", tmp_path / "mine.yaml", tmp_path / "out")]
     (tmp_path / "mine.yaml").write_text(dump_rig(RIG))

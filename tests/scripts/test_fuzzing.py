@@ -19,6 +19,7 @@ def whole(tmp_path_factory):
     return folder
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_every_verb_ends_within_two_seconds_of_ctrl_c():
     report = fuzz_interrupts(22, seed=0)
@@ -26,6 +27,7 @@ def test_every_verb_ends_within_two_seconds_of_ctrl_c():
     assert len(report.kinds) >= 9
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @pytest.mark.parametrize(
     "name",

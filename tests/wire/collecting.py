@@ -48,15 +48,15 @@ class Collecting:
         marker = self.session / "session.json"
         return len(Session.open(self.session).captures) if marker.exists() else 0
 
-    def wait_for(self, text, within_s=60.0, times=1):
+    def wait_for(self, text, within_s=180.0, times=1):
         """Wait until it has said something so often."""
         self._wait(lambda: self.said.count(text) >= times, f"{text!r} was not said", within_s)
 
-    def wait_for_captures(self, n, within_s=60.0):
+    def wait_for_captures(self, n, within_s=180.0):
         """Wait until the session holds so many."""
         self._wait(lambda: self.n_captures >= n, f"there are not {n} captures", within_s)
 
-    def wait(self, within_s=60.0):
+    def wait(self, within_s=180.0):
         """Wait for its end, and give its exit code."""
         return self._process.wait(within_s)
 

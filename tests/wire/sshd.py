@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 SSHD = shutil.which("sshd", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
-_START_S = 10.0
+_START_S = 60.0
 
 
 class NoServerError(Exception):

@@ -18,7 +18,8 @@ from tests.collect.live.replay import Show, placements, rig
 from tests.collect.live.sent import apart_s
 from tests.shared import changed
 
-QUICK = LiveOptions(n_wanted=3, timeout_s=120.0, hold_s=0.3)
+pytestmark = pytest.mark.realtime
+QUICK = LiveOptions(n_wanted=3, timeout_s=300.0, hold_s=0.3)
 HERE = "000000 shows the board here"
 
 
@@ -54,7 +55,7 @@ def test_collect_still_boards_are_captured(tmp_path):
     assert all(hold_s is not None and 0 <= hold_s <= 0.3 for hold_s in held)
     sounds = [cue.sound for cue in {cue.number: cue for s in states for cue in s.cues}.values()]
     assert sounds.count("captured") == 3
-    assert max(report.latencies_s) < 5.0
+    assert max(report.latencies_s) < 20.0
 
 
 @pytest.mark.long
@@ -70,7 +71,7 @@ def test_collect_keys_capture_skip_and_stop(tmp_path):
 
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         report = collect_live(
-            session, show.sources, LiveOptions(hold_s=60.0, timeout_s=50.0), states.append, key
+            session, show.sources, LiveOptions(hold_s=300.0, timeout_s=180.0), states.append, key
         )
         assert report.ending == "stopped"
         assert [capture.meta.get("by_hand") for capture in session.captures] == [1.0]
@@ -120,7 +121,7 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(tmp_path, monkeypatc
 
         def add_slowly(*given):
             """Write as a disk does that is busy until somebody has pressed the key."""
-            is_asked.wait(20.0)
+            is_asked.wait(60.0)
             return add(*given)
 
         monkeypatch.setattr(session, "add_capture", add_slowly)
@@ -184,7 +185,7 @@ def test_collect_lost_sensor_keeps_captures(tmp_path):
             show.sources[1].fail(SourceError("lidar: no packets for 2 s", "Check the cable."))
 
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
-        options = LiveOptions(hold_s=0.3, lost_s=1.0, timeout_s=30.0)
+        options = LiveOptions(hold_s=0.3, lost_s=1.0, timeout_s=180.0)
         report = collect_live(session, show.sources, options, unplug)
         assert report.ending == "lost" and report.error is not None
         assert "no packets" in report.error.what

@@ -214,6 +214,7 @@ def test_walk_continued_gets_new_placements():
         assert not any(places.are_alike({key: T_cam_board}, {key: T}) for T in walk.captured[:n_held])
 
 
+@pytest.mark.long
 def test_half_a_room_and_a_careless_person_will_do():
     careless = Person(place_sigma_m=0.2, turn_sigma_deg=15.0, ignored_share=0.5)
 

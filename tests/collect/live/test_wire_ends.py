@@ -25,6 +25,7 @@ from tests.collect.live.sent import (
 )
 from tests.shared import changed
 
+pytestmark = pytest.mark.realtime
 Start = Callable[..., WireRig]
 
 
@@ -94,7 +95,7 @@ def test_collect_ended_camera_is_named(wire, tmp_path):
     command = ("sh", "-c", "echo no such camera >&2; exit 3")
     broken = changed(rig.rig, cameras__cam__driver__command=command)
     rig.profile.write_text(dump_rig(broken))
-    with Collecting(rig.profile, tmp_path / "session", "--timeout", "3") as collecting:
+    with Collecting(rig.profile, tmp_path / "session", "--timeout", "10") as collecting:
         assert collecting.wait() == 6
     said = collecting.said.partition("ended: ")[0]
     assert "code 3" in said and "lidar is" not in said

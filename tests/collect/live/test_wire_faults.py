@@ -15,6 +15,7 @@ from lce_rig.devices import open_live
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_stamps, check_whole, errors, journal_of, read_sent
 
+pytestmark = pytest.mark.realtime
 Start = Callable[..., WireRig]
 # A host whose clock somebody sets by SET_S once a file is there: every reading of the time, the kernel's
 # stamps of arrivals left out, which no process can set.
@@ -153,7 +154,7 @@ def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(wire, tmp_path, monk
 
     with Session.create(tmp_path / "session", rig.rig) as session:
         monkeypatch.setattr(os, "fsync", flush_slowly)
-        options = LiveOptions(n_wanted=1, timeout_s=90.0, hold_s=0.0)
+        options = LiveOptions(n_wanted=1, timeout_s=240.0, hold_s=0.0)
         report = collect_live(
             session, open_live(rig.rig), options, lambda _state: states_s.append(time.monotonic())
         )

@@ -15,6 +15,8 @@ from lce_rig.rig.profile import SyncSettings, TriggerSettings
 from lce_rig.session import Session
 from tests.collect.live.sent import apart_s, check_sent, check_whole, read_sent
 
+pytestmark = pytest.mark.realtime
+
 
 class TriggeringBoard(FakeBoard):
     """Sends a pulse to the camera ten times a second, on the tenths of a second of UTC."""
@@ -65,7 +67,7 @@ def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(wire, reel, tmp_path
                 done = n_tied and states[-1].n_captures >= n_tied[0] + 3
                 return "stop" if done else None
 
-            options = LiveOptions(timeout_s=60.0, hold_s=0.0)
+            options = LiveOptions(timeout_s=180.0, hold_s=0.0)
             collect_live(session, open_live(rig), options, watch, stop)
     assert n_tied, states[-1].notes
     sent = read_sent(reel, rig.lidars["lidar"])

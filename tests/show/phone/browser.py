@@ -12,7 +12,7 @@ import aiohttp
 import cv2
 import numpy as np
 
-_START_S = 30.0
+_START_S = 120.0
 _ANSWER_S = 60.0
 _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -166,7 +166,7 @@ class Page(Line):
         found = f"[...document.querySelectorAll({selector!r})].map((each) => each[{name!r}])"
         return [str(value) for value in self.evaluate(found)]
 
-    def wait_until(self, expression, timeout_s=40.0):
+    def wait_until(self, expression, timeout_s=120.0):
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s
         while not self.evaluate(expression):

@@ -9,6 +9,7 @@ from lce_rig.show.phone.preview import Preview
 from .conftest import port_of, state
 from .watcher import Watcher
 
+pytestmark = pytest.mark.realtime
 FILES = ("", "page.css", "page.js", "stage.js", "live", "nothing-here")
 
 
@@ -76,7 +77,7 @@ def test_only_files_of_the_page_are_served(preview, path):
 )
 def test_guard_answers_its_own_address_only(headers, status):
     with Preview(port=0, token="abcdefgh") as preview:
-        line = http.client.HTTPConnection("127.0.0.1", port_of(preview), timeout=10)
+        line = http.client.HTTPConnection("127.0.0.1", port_of(preview), timeout=60)
         line.request("GET", "/?token=abcdefgh", headers=headers)
         assert line.getresponse().status == status
         line.close()

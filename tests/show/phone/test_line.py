@@ -7,6 +7,8 @@ from lce_rig.show.phone.preview import Preview
 from .conftest import port_of
 from .screen import OPEN, has_text, shown
 
+pytestmark = pytest.mark.realtime
+
 
 def test_it_says_that_the_line_is_lost_and_finds_back(browser):
     first = Preview(port=0, token="one-token")

@@ -9,6 +9,8 @@ from lce_rig.collect.live.state import Cue
 from .conftest import state
 from .screen import OPEN, has_text, shown
 
+pytestmark = pytest.mark.realtime
+
 
 def test_sounds_are_played_once_each_after_a_tap(preview, browser):
     counting = """

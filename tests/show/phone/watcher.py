@@ -34,7 +34,7 @@ class Watcher:
             self._http.ws_connect(f"{self.url}live{query}", headers=headers, max_msg_size=0)
         )
 
-    def receive(self, timeout_s=5.0):
+    def receive(self, timeout_s=60.0):
         """Give the next message: a document, bytes, or the number with which the connection was closed."""
         message = self._run(self.socket.receive(timeout_s))
         if message.type is aiohttp.WSMsgType.TEXT:
@@ -82,7 +82,7 @@ class Watcher:
 
     def _run(self, work):
         async def within() -> Any:
-            return await asyncio.wait_for(work, 10)
+            return await asyncio.wait_for(work, 120)
 
         return self._loop.run_until_complete(within())
 

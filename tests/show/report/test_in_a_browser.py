@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.mark.parametrize("width_px", [390, 1440])
 @pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
