@@ -123,9 +123,9 @@ def test_nudged_camera_is_named_and_the_other_kept(options):
     assert [own.estimated_with for own in found.values()] == [(), ()]
     assert found[RIGHT].verdict in ("marginal", "fail") and found[LEFT].verdict != "fail"
     assert not any(f.code == "verdict.moved" for f in found[LEFT].findings)
-    moved = [f for f in found[RIGHT].findings if f.code == "verdict.moved" and f.subject]
-    assert [f.subject.split(" to ") for f in moved] == [[LEFT, RIGHT]]
-    assert moved[0].figures["captures"] == tuple(f"{k:06d}" for k in range(6, 12))
+    (moved,) = [f for f in found[RIGHT].findings if f.code == "verdict.moved"]
+    assert not moved.subject and moved.figures["sensor"] == RIGHT
+    assert moved.figures["captures"] == tuple(f"{k:06d}" for k in range(6, 12))
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(in_use(found[LEFT].T_cam_lidar, found[LEFT].intrinsics), TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
