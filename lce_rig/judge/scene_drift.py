@@ -32,8 +32,7 @@ from lce_rig.scene.findings import (
 from lce_rig.scene.outline_score import OutlineScore, OutlineView
 
 CHANGED_CHI2 = 27.86
-"""Least chi-squared of changed extrinsics: a chance of 1e-4. The largest of unchanged ones that was measured
-is 23.6, in one of ten groups of three KITTI views: the covariance is optimistic there."""
+"""Least chi-squared of changed extrinsics: a chance of 1e-4."""
 _MIN_GAIN = 2.0  # Significance of a change if several fit about equally well.
 _OPINIONS: dict[State, Opinion] = {"changed": "contradicts", "unchanged": "agrees", "unknown": "unknown"}
 _LEVER_M = float(REACH[0] / REACH[3])  # makes angles comparable with distances

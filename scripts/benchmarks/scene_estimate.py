@@ -33,7 +33,7 @@ _GIVEN = (
     "002966",
     "003707",
     "004448",
-)  # Constants were chosen on these.
+)  # Most constants were chosen on these.
 _CHI2_95 = 12.59  # of six degrees of freedom
 _CHANGE = np.array([0.2, np.radians(1.0)])  # m, rad
 
@@ -43,7 +43,7 @@ _SIZE = "{:.2f} deg, {:.0f} mm"
 
 
 def bench_scene_estimate(n_trials: int, only: str = "") -> None:
-    """Print the tables; given views are those that constants were chosen on."""
+    """Print the tables; given views are those that most constants were chosen on."""
     lens, T, views = _views()
     given = [view for view in views if view.capture[:6] in _GIVEN]
     other = [view for view in views if view.capture[:6] not in _GIVEN]
