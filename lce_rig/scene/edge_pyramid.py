@@ -173,7 +173,8 @@ def _field(
     else:
         blurred = cv2.GaussianBlur(strength, (0, 0), sigmaX=along, sigmaY=across)
         window = window[::-1]
-    ratio = (blurred + _FLOOR) / (cv2.blur(blurred, window) + _FLOOR)
-    values = np.log(_OUTLIERS + (1 - _OUTLIERS) * ratio).astype(np.float32)
-    slopes = [cv2.Sobel(values, cv2.CV_32F, 1 - k, k) / (8 * reduction) for k in (0, 1)]
-    return np.dstack([values, *slopes]).astype(np.float32)
+    # OpenCV's logarithm and division take half the time of numpy's.
+    ratio = cv2.divide(blurred + np.float32(_FLOOR), cv2.blur(blurred, window) + np.float32(_FLOOR))
+    values = cv2.log(np.float32(_OUTLIERS) + np.float32(1 - _OUTLIERS) * ratio)
+    slopes = [cv2.Sobel(values, cv2.CV_32F, 1 - k, k, scale=1 / (8 * reduction)) for k in (0, 1)]
+    return np.asarray(cv2.merge([values, *slopes]), dtype=np.float32)

@@ -24,6 +24,7 @@ _UNITS = np.array([0.05, 0.05, 0.05, *np.radians([0.5, 0.5, 0.5])])  # Steps of 
 # Random starts at each width of the fields, coarse to fine, and maxima that go on from it.
 _N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
 _SEARCH_EDGES = 3000  # on all but the finest fields
+_COARSE, _FINE = 1e-6, 2e-9  # Relative gain of a step that ends a climb, on wide fields and the finest
 _SAME = 0.5  # Distance in units under which two maxima are one.
 _BEYOND = 1.5  # Largest distance from the start, in reaches
 
@@ -161,8 +162,12 @@ def find_better_focal(
     return better
 
 
-def _climb(score: OutlineScore, start: Array, reach: Array) -> tuple[Array, float]:
-    """Climb from a start to the next maximum (6,); returns its value, too."""
+def _climb(score: OutlineScore, start: Array, reach: Array, precision: float = _FINE) -> tuple[Array, float]:
+    """Climb from a start to the next maximum (6,), until steps gain less than `precision`, relatively.
+
+    Returns:
+        The maximum and its value.
+    """
     from scipy.optimize import minimize
 
     units = np.minimum(_UNITS, reach)
@@ -172,7 +177,8 @@ def _climb(score: OutlineScore, start: Array, reach: Array) -> tuple[Array, floa
         return -value, -slope * units
 
     bounds = [(-limit, limit) for limit in _BEYOND * reach / units]
-    climbed = minimize(fall, start / units, jac=True, method="L-BFGS-B", bounds=bounds)
+    options = {"ftol": precision}
+    climbed = minimize(fall, start / units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return np.asarray(climbed.x * units), -float(climbed.fun)
 
 
@@ -195,7 +201,9 @@ def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
         starts = rng.uniform(-1, 1, (n_starts, 6)) * reach
         order = np.argsort([-level.value(start) for start in starts])
         maxima += list(starts[order[:n_kept]])
-        climbed = sorted((_climb(level, start, reach) for start in maxima), key=lambda each: -each[1])
+        precision = _FINE if level is levels[-1] else _COARSE
+        found = [_climb(level, start, reach, precision) for start in maxima]
+        climbed = sorted(found, key=lambda each: -each[1])
         distinct: list[Array] = []
         for tangent, _ in climbed:
             if all(np.linalg.norm((tangent - other) / units) > _SAME for other in distinct):
