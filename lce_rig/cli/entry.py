@@ -8,6 +8,8 @@ from pathlib import Path
 
 from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_more, watch_for_interrupts
 
+# Share of the computer's memory and swap that a process may take: more makes it swap, and other programs end.
+_SHARE_OF_MEMORY = 0.8
 # Least limit, bytes: sound sessions need 0.7 GB at most.
 _LEAST_BYTES = 1 << 30
 
@@ -38,7 +40,7 @@ def main() -> None:
 
 
 def limit_memory() -> None:
-    """Limit the memory of this process, and of each that it starts, to 80 % of the computer's.
+    """Limit the memory of this process, and of each that it starts, to a share of the computer's.
 
     Beyond the limit Python raises MemoryError, which `reading` names with its file. Data are limited, not
     addresses: onnxruntime, Open3D and threads reserve far more of those than they use.
@@ -48,7 +50,7 @@ def limit_memory() -> None:
         size_kb = {words[0]: int(words[1]) for words in lines}
         total_bytes = 1024 * (size_kb["MemTotal:"] + size_kb["SwapTotal:"])
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        limit = max(int(0.8 * total_bytes), _LEAST_BYTES)
+        limit = max(int(_SHARE_OF_MEMORY * total_bytes), _LEAST_BYTES)
         resource.setrlimit(resource.RLIMIT_DATA, (limit if hard < 0 else min(limit, hard), hard))
 
 
