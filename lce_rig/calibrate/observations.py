@@ -12,9 +12,8 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import BoardSurface, ImageBoard, LidarBoard, Observation
 from lce_rig.rig import Rig
 
-SAME_PLACE_M = 0.03
-SAME_TURN_RAD = np.radians(3.0)
-"""Captures whose boards lie nearer show one placement; captures of one placement are not independent."""
+SAME_PLACE_M, SAME_TURN_RAD = 0.03, np.radians(3.0)
+"""Distance and angle of boards, m and rad, below which captures show one placement: not independent."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ BLENDS_M = 0.35
 _HALF_BEAM_M = 0.008  # of the beams that the priors of the shifts by the background are from
 BLENDS = 1
 """Column of `describe_background` that tells whether the background's echo blends into the board's."""
+# Least cosine of incidence (78 deg) for projection along rays, which multiplies errors by its inverse.
 _GRAZING_COSINE = 0.2
 
 

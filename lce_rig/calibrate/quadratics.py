@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
-_RELATIVE_FLOOR = 1e-12
-
 
 @dataclass(frozen=True, eq=False)
 class Quadratics:
@@ -114,7 +112,7 @@ def jackknife_scatter(moves: Array) -> Array:
 
 
 def symmetric_inverse(H: Array) -> Array:
-    """Invert symmetric positive semi-definite H (..., p, p), with a floor under its eigenvalues."""
+    """Invert symmetric positive semi-definite H (..., p, p), eigenvalues at least 1e-12 of the largest."""
     values, vectors = np.linalg.eigh(H)
-    floor = _RELATIVE_FLOOR * np.maximum(values[..., -1:], 1e-300)
+    floor = 1e-12 * np.maximum(values[..., -1:], 1e-300)
     return np.asarray((vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2))

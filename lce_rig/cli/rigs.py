@@ -206,7 +206,6 @@ def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
 _PLATE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)x(\d+(?:\.\d*)?|\.\d+)")
-_MARKER_SHARE, _TAG_SPACING = 0.75, 0.3
 # About the plate on the page; below it stand the profile block and how to mount the board.
 _MARGIN_MM, _TEXT_MM, _LINE_MM = 15.0, 75.0, 5.0
 _MM_PER_INCH = 25.4
@@ -263,11 +262,11 @@ def board(
         n_markers = cols * rows // 2
         names = [name for name in DICTIONARIES if name.startswith(f"{family}_")]
         more = {
-            "marker_m": round(_MARKER_SHARE * square_m, 6),
+            "marker_m": round(0.75 * square_m, 6),
             "dictionary": next((name for name in names if n_markers_of(name) >= n_markers), names[-1]),
         }
     elif kind == "aprilgrid":
-        more = {"tag_spacing": _TAG_SPACING}
+        more = {"tag_spacing": 0.3}  # as Kalibr's example
     less = 1 if kind == "checkerboard" else 0
     values = {"type": kind, KEYS_OF_TYPE[kind][0]: (cols - less, rows - less), "square_m": square_m, **more}
     width_m, height_m = map(float, outline.groups())

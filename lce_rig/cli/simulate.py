@@ -30,6 +30,7 @@ from lce_rig.simulate import (
 from lce_rig.simulate.sampling import stamp_of
 
 TRUTH = "truth.json"
+# Default size of a session, placements, and of a recording, s: each is simulated in a few minutes.
 _CAPTURES, _DURATION_S = 30, 20.0
 # Time to simulate 1 s of a recording, s.
 _WALL_PER_S = 10

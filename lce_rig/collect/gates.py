@@ -204,7 +204,6 @@ def _plane_motion_m(
     return float(np.abs(transform(reference.T_lidar_board, where) @ plane[:3] + plane[3]).max())
 
 
-SPEED_WINDOW_S = 0.5
 # Best speed of the board: slower ones give few events, faster ones smear.
 BEST_SPEED_MPS = 0.1
 
@@ -344,7 +343,8 @@ class MotionGate:
         self.judged: CaptureMoment | Refusal | None = None
         self._rig, self._taken, self._tally = rig, taken, tally
         self._takes_frames = takes_frames
-        self._half_ns, self._patience_ns = SPEED_WINDOW_S * 0.5e9, patience_s * 1e9
+        # The board's speed is measured over half a second about a detection.
+        self._half_ns, self._patience_ns = 0.25e9, patience_s * 1e9
         # The last detections wait for later ones near in time, and moments for better ones.
         self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0

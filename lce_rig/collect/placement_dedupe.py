@@ -13,7 +13,6 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.session import Capture, Session, check_capture
 
 ImageKey = tuple[str, str]
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 #: Placements moved and turned by less than this count as the same.
 MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
 
@@ -22,8 +21,9 @@ def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: floa
     """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
     way_m = np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
     # The pattern may be read from either end.
+    half_turn = np.diag([-1.0, -1.0, 1.0])
     R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
-    turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
+    turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ half_turn, R_others))
     return np.asarray((way_m < min_move_m) & (turn < min_turn_rad))
 
 

@@ -66,6 +66,7 @@ def _record(record: Any) -> Any:
     return {**record, "action": record.get("action_code"), "stored": words}
 
 
+# Adding 0.0 turns -0.0 into 0.0.
 _LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
 _WITHOUT_NULL = BeforeValidator(lambda values: {key: v for key, v in values.items() if v is not None})
 _NULL = PlainSerializer(lambda number: float(number) if math.isfinite(number) else None)

@@ -16,6 +16,7 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 
+# Angle between neighbouring lines and returns of a LiDAR without rings, deg, for guidance's predictions.
 _LINE_DEG = 0.5
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
-_STEPS, _SETTLED = 20, 1e-10
 # Degrees of freedom of the Student distribution that weights poses, as some may be outliers.
 _STUDENT = 5.0
 # 99 % of the chi-squared distribution with six degrees of freedom.
@@ -281,14 +280,14 @@ def mean_pose(
     """
     mean = T[0] if T_start is None else T_start
     weight = np.ones(len(T))
-    for _ in range(_STEPS):
+    for _ in range(20):
         apart = difference(T, mean)
         if weigh is not None:
             weight = weigh(np.einsum("ki,kij,kj->k", apart, information, apart))
         weighted = weight[:, None, None] * information
         step = np.linalg.solve(weighted.sum(axis=0), np.einsum("kij,kj->i", weighted, apart))
         mean = perturb(mean, step)
-        if np.linalg.norm(step) < _SETTLED:
+        if np.linalg.norm(step) < 1e-10:  # m and rad, far below any noise
             break
     return mean, weight
 

@@ -114,10 +114,7 @@ def significant(value: float, digits: int = 2) -> str:
     text = f"{value:.{digits}g}"
     if "e" not in text:
         return text
-    return f"{value:.0f}" if abs(value) >= 1 else f"below {_SMALLEST:g}" if value >= 0 else f"{value:.6f}"
-
-
-_SMALLEST = 0.0001
+    return f"{value:.0f}" if abs(value) >= 1 else "below 0.0001" if value >= 0 else f"{value:.6f}"
 
 
 def sizes(rotation_deg: float, translation_m: float) -> str:

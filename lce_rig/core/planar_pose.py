@@ -18,7 +18,6 @@ from lce_rig.core.geometry import (
 )
 
 _MAX_STEPS = 30
-_SAME_POSE_RAD = 1e-3
 Project: TypeAlias = Callable[[Array], tuple[Array, Array]]
 """From points (..., 3) in the camera to pixels (..., 2) and their derivative (..., 2, 3)."""
 
@@ -86,7 +85,8 @@ def solve_planar_pose(
     n = len(corners_px)
     variance = max(cost / max(2 * n - 6, 1), 1e-12)
     sigma_px = float(np.sqrt(variance))
-    is_same = bool(rotation_angle(T[:3, :3], T_other[:3, :3]) < _SAME_POSE_RAD)
+    # Both starts may end at one pose; distinct poses differ by far more.
+    is_same = bool(rotation_angle(T[:3, :3], T_other[:3, :3]) < 1e-3)
     has_other = np.isfinite(cost_other) and not is_same
     return PlanarPose(
         T_cam_board=T,

@@ -19,7 +19,6 @@ POSITION_BYTES = 512
 N_LASERS = 16
 N_BLOCKS = 12
 BLOCK_FLAG = 0xEEFF
-RANGE_STEP_M = 0.002
 #: Azimuths count 0.01 deg, clockwise from the y axis of the manual, which is the x axis of the lidar frame.
 AZIMUTH_STEPS = 36_000
 AZIMUTH_STEP_RAD = 2 * np.pi / AZIMUTH_STEPS

@@ -13,10 +13,12 @@ from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.rig import CameraSettings
 
-_WAIT_S, _SILENCE_S = 0.25, 10.0
+# Longest silence before a camera is lost, s: commands may take seconds to open one.
+_SILENCE_S = 10.0
+# Time for a command to end, s, before it is killed.
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
 _TAIL_BYTES = 2000
@@ -102,7 +104,7 @@ class ImagePipeSource(LiveSource):
         """Return the images that came; see `LiveSource`."""
         pictures, complaints = self._pipes()
         samples: list[LiveSample] = []
-        for key, _ in self._selector.select(_WAIT_S):
+        for key, _ in self._selector.select(READ_WAIT_S):
             data = os.read(key.fd, _PIPE_BYTES)
             if key.fileobj is complaints:
                 self._complaints = (self._complaints + data)[-_TAIL_BYTES:]

@@ -15,9 +15,12 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.io.findings import LIDAR_UTC
 
+# Window of the displayed rate, s: 15 scans at 5 Hz; a longer one shows changes later.
 _RATE_WINDOW_S = 3.0
 # Two seconds of images, six of scans: longer than a busy computer lets them wait.
 _N_SLOTS = 64
+READ_WAIT_S = 0.25
+"""Longest wait of a driver for data: a source's thread ends no later."""
 REOPEN_EVERY_S = 1.0
 
 T = TypeVar("T")

@@ -9,15 +9,15 @@ from typing import Any
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
-from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.rosbag import TopicDecoder
 from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 
-_WAIT_S, _SILENCE_S = 0.25, 5.0
-# Nodes find each other within a second on one computer, within a few on a network.
-_DISCOVERY_S = 5.0
+# Longest silence, and time for discovery, s: nodes find each other within a second on one computer, within a
+# few on a network.
+_SILENCE_S = _DISCOVERY_S = 5.0
 _DISCOVERY_STEP_S = 0.1
 
 
@@ -98,7 +98,7 @@ class Ros2Source(LiveSource):
 
     def read(self) -> list[LiveSample]:
         """Return the samples that came; see `LiveSource`."""
-        self._executor.spin_once(timeout_sec=_WAIT_S)
+        self._executor.spin_once(timeout_sec=READ_WAIT_S)
         came, self._waiting = self._waiting, []
         samples: list[LiveSample] = []
         for host_ns, data in came:

@@ -23,8 +23,6 @@ from lce_rig.timing.clock import NS_PER_S, ClockModel
 HELLO_S = 6.0
 SILENCE_S = 30.0
 
-_READ_S = 0.02
-_WRITE_S = 0.2
 _BY_ID = Path("/dev/serial/by-id")
 _N_SLOTS = 4096
 _GREET_AGAIN_NS = NS_PER_S
@@ -69,7 +67,7 @@ class SyncBoard(LiveSource):
         """
         # DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
         # them for a moment all the same.
-        port = serial.Serial(baudrate=self._settings.port_baud, timeout=_READ_S, write_timeout=_WRITE_S)
+        port = serial.Serial(baudrate=self._settings.port_baud, timeout=0.02, write_timeout=0.2)
         port.port, port.exclusive = self._settings.device, True
         port.dtr = port.rts = False
         try:

@@ -21,7 +21,7 @@ from lce_rig.core.phrasing import significant
 from lce_rig.devices import findings
 from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.devices.video_device import (
     VideoDevice,
     apply_controls,
@@ -34,7 +34,6 @@ from lce_rig.rig import CameraSettings, DriverSettings, FrameTimingSettings
 
 # Number of buffers: two drop images if the computer stalls for one, eight last for a quarter of a second.
 N_BUFFERS = 8
-_WAIT_S = 0.25
 _EXPOSURE_EVERY_S = 1.0
 _SILENT_HINT = (
     "Check the camera's cable and power; a triggered camera sends nothing without pulses (sync board, FSYNC)."
@@ -297,11 +296,11 @@ class V4l2Source(LiveSource):
     def read(self) -> list[LiveSample]:
         """Return the image that came; see `LiveSource`."""
         try:
-            came = self._device.read(_WAIT_S)
+            came = self._device.read(READ_WAIT_S)
         except OSError:
             # The kernel calls it temporary; should it last, the silence ends it.
             self._n_damaged += 1
-            time.sleep(_WAIT_S)
+            time.sleep(READ_WAIT_S)
             return []
         if came is None:
             return []

@@ -23,6 +23,7 @@ from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
+"""Longest silence before a LiDAR is lost: 1,500 packets."""
 # Least duration of packets that the buffer must hold: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01

@@ -30,8 +30,6 @@ from lce_rig.rig.profile import BOARD, PPS_LINE
 from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 
-_PROBE_BYTES, _PROBE_BLOCK_BYTES, _PROBE_S = 48 << 20, 4 << 20, 0.5
-_MB = 1e6
 # A capture is a few MB; raw images of 1280x720 px at 30 Hz are 55 MB/s.
 _MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
 _MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
@@ -52,17 +50,17 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
     folder = exam.folder.absolute()
     folder = next(path for path in (folder, *folder.parents) if path.exists())
     try:
-        free_mb = shutil.disk_usage(folder).free / _MB
-        block = os.urandom(_PROBE_BLOCK_BYTES)  # disks that compress are not fooled
+        free_mb = shutil.disk_usage(folder).free / 1e6
+        block = os.urandom(4 << 20)  # disks that compress are not fooled
         n_bytes, start_s = 0, time.monotonic()
         with tempfile.TemporaryFile(dir=folder) as file:
-            # Half a second at most, each block flushed as a capture's files are.
-            while n_bytes < _PROBE_BYTES and time.monotonic() - start_s < _PROBE_S:
+            # Half a second or 48 MiB at most, each block flushed as a capture's files are.
+            while n_bytes < 48 << 20 and time.monotonic() - start_s < 0.5:
                 file.write(block)
                 file.flush()
                 os.fsync(file.fileno())
                 n_bytes += len(block)
-        write_mbps = n_bytes / _MB / max(time.monotonic() - start_s, 1e-9)
+        write_mbps = n_bytes / 1e6 / max(time.monotonic() - start_s, 1e-9)
     except OSError as error:
         yield findings.DISK_NOT_WRITABLE(folder=str(folder), cause=error.strerror)
         return

@@ -39,6 +39,7 @@ RECORD, USED = ".deployed.json", ".used"
 MAX_OUTPUT = 1 << 24
 """Bytes of a program's output that are kept, the last ones."""
 _RUN_OUTPUT = 1 << 16
+# Longest time of a script, and of a copy, s; largest file and set that are copied, KiB.
 _SCRIPT_S, _COPY_S = 120.0, 1800.0
 _LARGEST_KB = 4 << 20
 _LOST = 255

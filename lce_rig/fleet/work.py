@@ -248,7 +248,6 @@ def publish(
     return [row | {"is_new": True} for row in rows]
 
 
-_WATCH_S = 0.5
 _DETAIL_BYTES = 2000
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
@@ -334,7 +333,7 @@ def main() -> None:
 
     def end_with_parent() -> None:
         while os.getppid() == parent:
-            time.sleep(_WATCH_S)
+            time.sleep(0.5)
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()

@@ -19,7 +19,6 @@ MAX_OFFSET_M = 0.015
 INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
 RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
 TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
-MIN_RANGE_M = 1e-3
 # Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
 _FARTHEST_MEDIAN = 3.0
 # A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
@@ -184,7 +183,7 @@ def to_scan(
     x, y, z = points.T.astype(np.float64)
     flat_m = np.hypot(x, y)
     # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
-    is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
+    is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > 1e-3)
     if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
     # Returns of the LiDAR's housing and mount are on no ring and are not used.

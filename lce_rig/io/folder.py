@@ -31,7 +31,6 @@ from lce_rig.timing.clock_fit import nearest
 
 IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
 CLOUD_FOLDERS = ("pcd", "raw_pcd", "cloud", "clouds", "lidar", "velodyne", "points", "pointcloud", "ply")
-MOSTLY = 0.9
 IN_ORDER = "paired in sorted order"
 
 
@@ -94,7 +93,8 @@ def pair_names(
         near = _nearest_pairs(image_ns, cloud_ns, tolerance_s)
         candidates.append((near, f"paired by nearest time within {tolerance_s:g} s"))
     for pairs, reason in candidates:
-        if len(pairs) >= MOSTLY * min(n, len(clouds)):
+        # A few files may lack a partner.
+        if len(pairs) >= 0.9 * min(n, len(clouds)):
             return pairs, reason
     if may_count and n == len(clouds):
         reason = IN_ORDER

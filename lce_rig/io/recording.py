@@ -17,7 +17,6 @@ from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import event_channel, rig_time_ns, stream_of
 
 _END_BYTES = 65536
-_MAX_OFFSET_S = 3600.0
 # September 2001: clocks that count from 1970 read more, those that count from their start less.
 _SINCE_1970_S = 1e9
 _CLOCK_JUMP_NS = 1_000_000_000
@@ -254,7 +253,7 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
         if overlap_s < -_ROUGH_S:
             key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
             hint = "Record both at the same time on one computer's clock, preferably into one bag."
-            if abs(scan_0 - first) <= _MAX_OFFSET_S:
+            if abs(scan_0 - first) <= 3600.0:  # further apart, they are of two recordings
                 hint = (
                     "If they were recorded together, add the difference of their clocks to "
                     f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."

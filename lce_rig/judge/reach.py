@@ -17,6 +17,7 @@ from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import LensModel, model_of
 
 DISTANCES_M = (5.0, 10.0, 20.0)
+"""Distances of the points whose uncertainty is reported: beyond the boards, where rotation errors grow."""
 # Smallest part along an eigen-direction that is named, standard deviations.
 _NAMED_SIGMAS = 2.0
 # Beyond some radius the distortion is undefined; corners are moved to that radius.

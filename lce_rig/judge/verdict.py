@@ -387,13 +387,13 @@ def distance_findings(
     """
     first, second = np.triu_indices(len(in_camera), 1)
     camera_m, lidar_m = (np.linalg.norm(c[first] - c[second], axis=1) for c in (in_camera, in_lidar))
-    is_far = (camera_m > _FAR_APART_M) & (lidar_m > _FAR_APART_M)
+    is_far = (camera_m > 0.5) & (lidar_m > 0.5)  # m; noise changes their ratio little
     if np.count_nonzero(is_far) < 3:
         return []
     ratios = np.log(camera_m[is_far] / lidar_m[is_far])
     ratio = float(np.median(ratios))
     sigma = 1.4826 * float(np.median(np.abs(ratios - ratio))) / np.sqrt(len(in_camera))
-    if abs(ratio) < max(_COARSE_SCALE, 4 * sigma):
+    if abs(ratio) < max(0.03, 4 * sigma):
         return []
     scale = float(np.exp(ratio))
     return [
@@ -405,6 +405,3 @@ def distance_findings(
             profile_square_m=square_m,
         )
     ]
-
-
-_FAR_APART_M, _COARSE_SCALE = 0.5, 0.03

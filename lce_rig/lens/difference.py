@@ -16,7 +16,6 @@ from lce_rig.core.geometry import Array, exp_so3, log_so3, project_to_so3, skew
 from lce_rig.lens.models import LensModel, model_of
 
 _GRID = 40
-_NEARLY_ALL = 98.0
 _STEPS = 10
 # Fewer pixels covered by both models do not determine a rotation.
 _LEAST_ALIGNED = 10
@@ -60,7 +59,7 @@ class LensCertainty:
     def image_sigma_px(self) -> float:
         """Standard deviation that 98 % of the image's pixels do not exceed; infinite if they have no ray."""
         sigma_px = np.where(np.isnan(self.sigma_px), np.inf, self.sigma_px)
-        return float(np.percentile(sigma_px, _NEARLY_ALL, method="higher"))
+        return float(np.percentile(sigma_px, 98.0, method="higher"))
 
 
 def compare_lenses(

@@ -97,7 +97,7 @@ MODELS = {
             "rational",
             "radtan",
             ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-            (_NO_PRIOR,) * 4 + (0.3,) * 4,
+            (_NO_PRIOR,) * 4 + (0.3,) * 4,  # k3 to k6; wider ones leave the polynomials' ratio undetermined
         ),
         LensModel("equidistant", "equidistant", ("k1", "k2", "k3", "k4"), (_NO_PRIOR,) * 4),
     )

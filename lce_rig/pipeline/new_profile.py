@@ -43,7 +43,6 @@ _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
     "equidistant": "equidistant",
     "fisheye": "equidistant",
 }
-_SLOWEST_LIDAR_HZ = 2.0
 _BOARD_SIGMAS = ("pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m")
 _COMMENTS = {
     "board": "measure it; do not rely on the CAD model",
@@ -226,7 +225,7 @@ def _lidar(
         rate_hz = round(topic.rate_hz or 0.0, 1)
         # Single scans, seconds apart, say nothing of how fast the LiDAR turns; without rings, scans are
         # accumulated to the rate of the profile.
-        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ and settings.has_rings else {}
+        block |= {"rate_hz": rate_hz} if rate_hz >= 2.0 and settings.has_rings else {}
     if sheet is not None and sheet.has_rings and cloud is not None:
         try:
             found = compare_beams(to_scan(cloud, name, settings, where), settings)

@@ -41,8 +41,6 @@ from lce_rig.timing.scan_pairing import (
     stream_of,
 )
 
-_LIVE_WAIT_S = 0.2
-
 _Item = TypeVar("_Item")
 
 
@@ -165,7 +163,7 @@ class SceneCaptures:
             FrameFeed(self._rig, sensors, clock, board, are_events_enough=True) as feed,
         ):
             while not is_over(n_frames):
-                frame = feed.take(_LIVE_WAIT_S)
+                frame = feed.take()
                 if frame is not None:
                     n_frames += 1
                     self.take_frame(frame)

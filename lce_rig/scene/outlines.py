@@ -18,10 +18,9 @@ UPRIGHT, LEVEL, REFLECTIVITY = range(len(KINDS_OF_EDGES))
 
 _N_NEIGHBOURS = 24  # returns: two rings on either side of an HDL-64E, and five azimuth steps
 _NEAR_RAD = 0.016  # Largest angle to a neighbour: twice the gap between the lower rings of an HDL-64E.
-_JUMP_M = 0.3
-_JUMP_STEPS = (
-    3.0  # Smallest ratio of a jump to the step on the near surface, which a slanted wall has as well.
-)
+_JUMP_M = 0.3  # Smallest jump of range at an outline: above the relief of one surface, twice `_JOINT_M`.
+# Smallest ratio of a jump to the step on the near surface, which a slanted wall has as well.
+_JUMP_STEPS = 3.0
 _FULL_JUMP_M = 3.0  # Larger jumps have no larger weight.
 _JOINT_M, _JOINT_SHARE = 0.15, 0.02  # Largest step on one surface: m, and share of the range.
 

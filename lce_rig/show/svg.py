@@ -21,6 +21,7 @@ All lengths of this module are units of the view box, as long as a point in prin
 """
 LEFT, RIGHT, TOP, BOTTOM = 30.0, 8.0, 18.0, 30.0
 """Margins around the axes, for ticks and labels."""
+# Size of the font, and distances of labels from the axes, in units of the view box.
 _FONT = 8.5
 _TICK_GAP, _LABEL_BELOW, _TITLE_ABOVE = 3.5, 23.0, 6.0
 # Fraction of the font size from the middle of a digit to the baseline.

@@ -13,6 +13,7 @@ from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words
 
 Row = Sequence[str]
+# Step of central differences, m and rad: near the cube root of double precision, where their error is least.
 _STEP = 1e-6
 _SCENE = {"agrees": "agree with the extrinsics", "contradicts": "contradict the extrinsics"}
 

@@ -20,6 +20,7 @@ from lce_rig.simulate.options import EventNoise
 from lce_rig.simulate.scene import join_rows
 
 _NS_PER_US = 1000
+# Least drawn threshold, change of log intensity: at 0 a pixel would send events without end.
 _LEAST_THRESHOLD = 0.05
 # A pixel in the dark keeps this share of the bandwidth that full white gives it: the photoreceptor's bias.
 _DARK_BANDWIDTH = 0.1

@@ -195,8 +195,6 @@ def _candidate(
 
 
 _N_SWAYS = 4
-_SWAY_HZ = (0.4, 1.2)
-_TREMOR_HZ = (5.0, 9.0)
 #: Distance from the plate's middle at which a trembling hand holds it, m: turns its way into an angle.
 _ARM_M = 0.4
 #: The speed is that of the second before the anchor, whose events form the image.
@@ -314,7 +312,7 @@ def _draw_sways(
     T_world_board: Array, speed_mps: float, hand: HandMotion, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
     """Draw frequencies (M,), amplitudes (M, 6) and phases (M, 6) of the given rms speed, and the tremor."""
-    frequency_hz = rng.uniform(*_SWAY_HZ, _N_SWAYS)
+    frequency_hz = rng.uniform(0.4, 1.2, _N_SWAYS)
     phase_rad = rng.uniform(0, 2 * np.pi, (_N_SWAYS + 1, 6))
     rate = rng.standard_normal((_N_SWAYS, 6))
     # Hands move a board sideways more than towards the sensors.
@@ -330,4 +328,4 @@ def _draw_sways(
         rng.standard_normal((1, 6)) * hand.tremor_m * np.array([1, 1, 1, 1 / _ARM_M, 1 / _ARM_M, 1 / _ARM_M])
     )
     amplitude = np.concatenate([rate / (2 * np.pi * frequency_hz[:, None]), tremor])
-    return np.append(frequency_hz, rng.uniform(*_TREMOR_HZ)), amplitude, phase_rad
+    return np.append(frequency_hz, rng.uniform(5.0, 9.0)), amplitude, phase_rad

@@ -11,20 +11,16 @@ from lce_rig.simulate.options import Carrier, Furnish, Obstacles, Part
 from lce_rig.simulate.scene import Raycaster, Surface
 from lce_rig.simulate.surfaces import Material, Mesh, box, cone, ellipsoid, inside_box, limb, merge, rectangle
 
+# Materials by eye; none was measured. Dark ones of low reflectivity return weakly, the window not at all.
 _WALL = Material((0.66, 0.70, 0.72), 0.75)
-_FLOOR = Material((0.42, 0.47, 0.50), 0.45, "tiles")
-_CEILING = Material((0.75, 0.77, 0.78), 0.8, "panels")
 _SKIRTING = Material((0.05, 0.06, 0.08), 0.15)
 _WOOD = Material((0.16, 0.30, 0.48), 0.5, "wood")
-_LEGS = Material((0.28, 0.28, 0.28), 0.35)
 _RED = Material((0.05, 0.05, 0.45), 0.5)
 _DARK = Material((0.03, 0.03, 0.035), 0.1)
-_CARDBOARD = Material((0.22, 0.38, 0.50), 0.6, "cloth")
 _POSTER = Material((0.9, 0.9, 0.9), 0.8, "poster")
-_LAMP = Material((1.0, 1.0, 1.0), 0.7, emission=1.6)
-_WINDOW = Material((0.95, 0.90, 0.86), 0.0, "window", emission=1.0)
 
 LIDAR_HEIGHT_M = 1.0
+"""Height of the LiDAR above the floor: about that at which people hold boards."""
 # Room frame: x along the first camera's sight, y left, z up, origin on the floor below the LiDAR.
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
@@ -114,10 +110,10 @@ def _shell(low: Array, high: Array) -> list[Part]:
     lamps = [box((1.2, 0.3, 0.04), (x, y, high[2] - 0.02)) for x, y in _LAMP_SPOTS]
     return [
         *(_part("wall", face, _WALL) for face in faces[:4]),
-        _part("floor", faces[4], _FLOOR),
-        _part("ceiling", faces[5], _CEILING),
+        _part("floor", faces[4], Material((0.42, 0.47, 0.50), 0.45, "tiles")),
+        _part("ceiling", faces[5], Material((0.75, 0.77, 0.78), 0.8, "panels")),
         _part("skirting", merge(skirting), _SKIRTING),
-        _part("lamp", merge(lamps), _LAMP),
+        _part("lamp", merge(lamps), Material((1.0, 1.0, 1.0), 0.7, emission=1.6)),
     ]
 
 
@@ -128,19 +124,21 @@ def _furniture() -> list[Part]:
     left, right, front, back = (
         np.array(v, dtype=np.float64) for v in ([0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0])
     )
+    cardboard = Material((0.22, 0.38, 0.50), 0.6, "cloth")
+    glass = Material((0.95, 0.90, 0.86), 0.0, "window", emission=1.0)
     return [
         _part("pillar", pillar, _WALL),
         _part("skirting", box((0.64, 0.64, 0.12), (5.2, 1.5, 0.06)), _SKIRTING),
         _part("table", box((1.6, 0.95, 0.035), (5.45, -2.52, 0.737)), _WOOD),
-        _part("table legs", merge(legs), _LEGS),
+        _part("table legs", merge(legs), Material((0.28, 0.28, 0.28), 0.35)),
         _part("screen", merge([screen, cone((5.32, -2.55, 0.75), (5.32, -2.55, 1.0), 0.03)]), _DARK),
-        _part("carton", box((0.45, 0.4, 0.32), (5.95, -2.5, 0.915)), _CARDBOARD),
+        _part("carton", box((0.45, 0.4, 0.32), (5.95, -2.5, 0.915)), cardboard),
         _part("bin", cone((4.35, 2.9, 0.0), (4.35, 2.9, 0.55), 0.17, 0.2), _RED),
         _part("cabinet", box((0.25, 0.7, 0.95), (6.6, 3.28, 1.25)), _RED),
         _part("shelf", box((0.6, 0.8, 1.9), (2.25, 2.98, 0.95)), _WOOD),
         _part("door", box((1.0, 0.06, 2.1), (2.6, -3.08, 1.05)), _WOOD),
         _part("window frame", box((0.08, 3.7, 2.0), (8.98, 0.6, 1.7)), _DARK),
-        _on_wall("window", (3.6, 1.9), np.array([8.93, 0.6, 1.7]), front, _WINDOW),
+        _on_wall("window", (3.6, 1.9), np.array([8.93, 0.6, 1.7]), front, glass),
         _on_wall("poster", (0.9, 1.2), np.array([4.9, 3.39, 1.55]), left, _POSTER),
         _on_wall("poster", (0.9, 1.2), np.array([7.4, -3.09, 1.6]), right, _POSTER),
         _on_wall("poster", (0.9, 1.2), np.array([8.98, -2.2, 1.6]), front, _POSTER),
@@ -149,11 +147,9 @@ def _furniture() -> list[Part]:
     ]
 
 
-_STEEL = Material((0.50, 0.50, 0.50), 0.5)
+# Materials of the carriers, by eye as the room's.
 _RUBBER = Material((0.03, 0.03, 0.03), 0.08)
 _SKIN = Material((0.30, 0.42, 0.62), 0.6)
-_HAIR = Material((0.02, 0.02, 0.025), 0.12)
-_TROUSERS = Material((0.16, 0.13, 0.11), 0.35, "cloth")
 SHIRTS = (
     Material((0.20, 0.10, 0.07), 0.55, "cloth"),
     Material((0.12, 0.12, 0.30), 0.45, "cloth"),
@@ -215,7 +211,7 @@ def _stand(board: Board, T_world_board: Array) -> list[Surface]:
     R_floor = R.copy()
     R_floor[2, 3] = 0.0
     return [
-        Surface("stand", merge([poles, arm, deck.moved(R)]), _STEEL, R),
+        Surface("stand", merge([poles, arm, deck.moved(R)]), Material((0.50, 0.50, 0.50), 0.5), R),
         Surface("stand wheels", merge(wheels).moved(R_floor), _RUBBER, R),
     ]
 
@@ -259,8 +255,8 @@ def build_body(size: float) -> dict[str, tuple[Mesh, Material | None]]:
     return {
         "torso": (merge(torso), None),
         "head": (merge(head), _SKIN),
-        "hair": (merge(hair), _HAIR),
-        "legs": (merge(legs), _TROUSERS),
+        "hair": (merge(hair), Material((0.02, 0.02, 0.025), 0.12)),
+        "legs": (merge(legs), Material((0.16, 0.13, 0.11), 0.35, "cloth")),
         "shoes": (merge(shoes), _RUBBER),
     }
 

@@ -21,8 +21,11 @@ from lce_rig.simulate.placements import Trajectory
 from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO
 
 GREY = np.array([0.114, 0.587, 0.299])
+"""Weights of blue, green and red in a grey value (ITU-R BT.601), as OpenCV's."""
 Window = tuple[slice, slice]
 Float = NDArray[np.float32]
+# Motion of the board between sub-frames, px, as long as their interval is within `_STEP_NS`: below a pixel,
+# so that edges cross each one gradually.
 _STEP_PX = 0.4
 _STEP_NS = (500_000, 5_000_000)
 _ALONG = np.linspace(0, 1, 17)[:, None, None]

@@ -16,19 +16,13 @@ from lce_rig.timing.clock import NS_PER_S, ClockModel
 MIN_PAIRS = 4
 # A timestamp in whole microseconds cannot scatter by less.
 _FLOOR_NS = 1000.0 / np.sqrt(12)
-
-_QUICK = 0.4
-
-_SHARP = 0.1
-_OUTLIER_SIGMAS = 3.5
 _N_ROUNDS = 10
 _N_STRETCHES = 8
 _MIN_INLIERS = 3
 _MAX_PAIRS = 2048
 _N_WITNESSES = 3
-_STEP_SIGMAS = 8.0
-# Least step that counts as a jump, even with exact readings.
-_MIN_STEP_NS = 200_000.0
+# Least step that counts as a jump, in standard deviations of the readings and, even with exact ones, in ns.
+_STEP_SIGMAS, _MIN_STEP_NS = 8.0, 200_000.0
 # Length of the fitted window: drift changes with temperature, so older readings are dropped.
 _WINDOW_NS = 60 * NS_PER_S
 
@@ -63,7 +57,7 @@ def fit_clock(
     if n_readings < MIN_PAIRS:
         return None
     bound_ns = np.zeros(n_readings) if bound_ns is None else bound_ns
-    n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * n_readings)))
+    n_quick = max(MIN_PAIRS, int(np.ceil(0.4 * n_readings)))
     is_quick = bound_ns <= np.sort(bound_ns)[n_quick - 1]
     source_ns, reference_ns, bound_ns = source_ns[is_quick], reference_ns[is_quick], bound_ns[is_quick]
     least_ns = float(bound_ns.min())
@@ -144,7 +138,7 @@ class LineFit:
     @property
     def sigma_ns(self) -> Array:
         """The readings' standard deviations (N,) before their scatter is known (2)."""
-        usual_ns = max(float(np.quantile(self.excess_ns, _SHARP)), np.sqrt(3) * _FLOOR_NS)
+        usual_ns = max(float(np.quantile(self.excess_ns, 0.1)), np.sqrt(3) * _FLOOR_NS)
         return np.asarray(np.sqrt((usual_ns**2 + self.excess_ns**2) / 3))
 
     def select(self, keep: NDArray[np.bool_]) -> "LineFit":
@@ -196,7 +190,7 @@ class LineFit:
         keep = np.ones(len(residual), dtype=np.bool_)
         for _ in range(_N_ROUNDS):
             scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
-            near = np.abs(residual) <= _OUTLIER_SIGMAS * scale
+            near = np.abs(residual) <= 3.5 * scale
             if near.sum() < _MIN_INLIERS or np.ptp(self.x_s[near]) == 0 or np.array_equal(near, keep):
                 break
             keep = near

@@ -166,7 +166,7 @@ def _returns(scan, model, n_blocks):
     assert not rest_ns.any() and 0 <= sequence.min() <= sequence.max() < 2 * n_blocks
     from_laser = scan.points.astype(np.float64)
     from_laser[:, 2] -= model.vertical_offsets_m[laser]
-    steps = np.rint(np.linalg.norm(from_laser, axis=1) / velodyne.RANGE_STEP_M)
+    steps = np.rint(np.linalg.norm(from_laser, axis=1) / VLP_16.range_step_m)
     returns = np.zeros((2 * n_blocks, velodyne.N_LASERS), velodyne.DATA_BLOCK["returns"].base)
     returns["range"][sequence, laser] = np.minimum(steps, np.iinfo(np.uint16).max)
     returns["reflectivity"][sequence, laser] = np.clip(np.rint(scan.intensity), 0, 255)

@@ -33,7 +33,9 @@ from lce_rig.calibrate.algorithm_1.registration import (
 )
 from lce_rig.core.geometry import Array
 
-RELATIVE_GAP = 1e-6
+# Largest gap of a global minimum, as a share of its cost: far below what noise changes.
+_RELATIVE_GAP = 1e-6
+# The same where the cost is nearly zero, as a share of Q's trace: rounding of double precision, with margin.
 _ROUNDING = 1e-11
 _BARRIER_STEPS = 60
 
@@ -66,7 +68,7 @@ def certify(Q: Array, R: Array) -> Certificates:
         R: (B, 3, 3) candidates, as `minimise_on_so3` gives them.
     """
     cost = rotation_cost(Q, R)
-    tolerance = RELATIVE_GAP * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
+    tolerance = _RELATIVE_GAP * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
     Z, bound, stationarity = _least_norm_dual(Q, R)
 
     def gap_at(eigenvalue: Array, rows: NDArray[np.intp]) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 
 N_ROTATION = 9
+# Limit of Newton steps, and length of the last one, rad: the next would be below double precision.
 _MAX_STEPS, _TOLERANCE_RAD = 50, 1e-8
 # Eigenvalues of the linear block below this share of the largest count as unseen.
 _RELATIVE_FLOOR = 1e-12

@@ -24,6 +24,7 @@ from lce_rig.core.geometry import Array
 STRAY = 0.01
 """Fraction b of (1), from simulated and recorded captures; a is estimated."""
 _LOST_STEPS = 1.1
+"""Mean of `lost` of (1), steps: about one return. With less, ends short of several returns are stray."""
 # Range of blurs and lost fractions in the information table. Narrower ones count as the narrowest; wider
 # ones leave a normal density.
 _NARROWEST = 0.01

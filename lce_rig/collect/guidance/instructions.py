@@ -14,7 +14,7 @@ from lce_rig.core.geometry import Array, exp_so3
 
 Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
-STEP_M = 0.6
+_STEP_M = 0.6  # Length of a person's step to the side.
 _ROTATIONS = ("tilt", "turn", "roll")
 #: Differences, m and deg, below which no instruction is given: people cannot follow smaller ones.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
@@ -135,9 +135,9 @@ def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, flo
 def _in_words(kind: Kind, amount: float) -> str:
     size = abs(amount)
     if kind == "sideways":
-        steps = round(size / STEP_M)
+        steps = round(size / _STEP_M)
         way = "one step" if steps == 1 else f"{steps} steps"
-        way = f"{10 * round(10 * size)} cm" if size < 0.75 * STEP_M else way
+        way = f"{10 * round(10 * size)} cm" if size < 0.75 * _STEP_M else way
         return f"{way} {'left' if amount > 0 else 'right'}"
     if kind == "nearer":
         return f"{size:.1f} m {'closer' if amount > 0 else 'back'}"

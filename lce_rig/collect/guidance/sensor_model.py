@@ -95,7 +95,9 @@ def _as_measured(priors: Priors, levels: Levels, known: KnownLidar) -> tuple[Pri
     return measured, replace(levels, laser_m=range_m)
 
 
+#: Least planned distance of the board from the camera, m: nearer, it exceeds the image or the LiDAR's field.
 NEAREST_M = 1.2
+#: Tilts of planned placements, deg: none, and two rings of directions; steeper ones shorten the squares.
 TILTS_DEG = (0.0, 22.0, 42.0)
 N_TILT_DIRECTIONS = 8
 _N_TILTS = 8

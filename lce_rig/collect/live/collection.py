@@ -39,7 +39,6 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
 
-_WAIT_S = 0.1
 # Switch interval of threads: sensor threads need the interpreter often and briefly, the loop holds it for
 # long. At Python's 5 ms, guidance would be slower by a third.
 _TURN_S = 0.0005
@@ -142,7 +141,7 @@ class _Loop:
     def run(self, show: Callable[[LiveState], None], keys: Callable[[], Key | TakeBack | None]) -> None:
         """Collect until an ending; losses are noted while the sensors are still open."""
         while True:
-            frame = self._feed.take(_WAIT_S)
+            frame = self._feed.take()
             self.take_kept()
             if frame is not None:
                 detection = self._search.sight(frame)

@@ -15,7 +15,9 @@ from lce_rig.rig import Rig
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.scan_pairing import LIVE_NS, Frame, event_channel, pair_by_time
 
+# Longest wait for a sample or frame, s: keys and the end are noticed no later.
 _WAIT_S = 0.1
+# Interval at which the rig's clock takes the sync board's models, s: at 20 ppm it drifts by 10 us in it.
 _REFRESH_S = 0.5
 
 
@@ -72,7 +74,7 @@ class FrameFeed:
         self._stop.set()
         self._thread.join()
 
-    def take(self, timeout_s: float) -> Frame | None:
+    def take(self, timeout_s: float = _WAIT_S) -> Frame | None:
         """Take the newest frame; None if no frame came in time.
 
         Raises:

@@ -14,9 +14,9 @@ from lce_rig.core.geometry import Array
 from lce_rig.devices.reading import SourceStatus
 from lce_rig.session import Session
 
+# Longest time without an update of the views, s, and interval at which the sensors' states are read.
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
-_TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
 _MET, _COUNTED = "the target is predicted to be met", "enough placements"
 _WAIT = "waiting for the sensors"
@@ -71,7 +71,7 @@ class Monitor:
         """Take the narration of the last detection."""
         self._narration, self._guide = narration, guide
         # Tick every half second while the board is held.
-        ticks_left = None if narration.hold_s is None else int(narration.hold_s / _TICK_S)
+        ticks_left = None if narration.hold_s is None else int(narration.hold_s / 0.5)
         if ticks_left not in (None, self._ticks_left):
             self.cue("tick")
         self._ticks_left = ticks_left

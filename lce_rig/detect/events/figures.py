@@ -129,7 +129,6 @@ def _length(vector: Array, cov: Array) -> tuple[float, float]:
     return length, float(np.sqrt(vector @ cov @ vector)) / length
 
 
-_MAX_HOT_SHARE = 0.5
 # Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
 _SLOW_EVENTS_PX = 4.0
 
@@ -202,7 +201,7 @@ def explain_missing_board(
     counts = events_per_pixel(recent)
     is_hot = hot_pixels(counts)
     n_hot, hot_share = int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))
-    if hot_share > _MAX_HOT_SHARE:
+    if hot_share > 0.5:  # most events
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
     # Blocks of pixels together as large as a board, busiest first.
     of_blocks = np.sort(events_per_block(recent))[::-1]

@@ -27,7 +27,7 @@ _MAD = 1.4826  # standard deviation of normal noise over its median magnitude
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
 _MIN_SMEARED = 8  # minimum number of ring ends to measure a smear: a fit takes five freedoms
 _CROSSING = 0.3  # minimum share of its gaps by which a ring crosses a side, for ends that show a smear
-SIZE_PRIOR_M = 0.10
+SIZE_PRIOR_M = 0.10  # standard deviation a priori of a plate's sides: wide, so that ring ends determine them
 SLACK_M = 0.05  # maximum distance of a measured border from the nominal one
 
 
@@ -190,9 +190,8 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
     return smear_m
 
 
-SURROUND_M = 0.20
 MIN_POINTS = 12
-EDGE_TOLERANCE_M = 0.012
+EDGE_TOLERANCE_M = 0.012  # scatter of ring ends beyond their steps at a sharp border; a larger one is smear
 BORDER_M = 0.06  # width inside the outline of the returns that measure the board's brightness there
 SETTLED_M = 0.01  # movement of the outline too small to change the returns inside it, and so the plane
 
@@ -282,7 +281,8 @@ def refine(
         The beams about the plate and the outline among them, with its error; None if too few returns lie
         on the plane inside the outline, or too many beyond it.
     """
-    radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
+    # Returns around it on the same plane disprove a plate.
+    radius_m = float(np.hypot(*placement.half_m)) + 0.20
     tolerance_m = 4.0 * scan.sigma_m + 0.01
     near = beams_about(scan, centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m], 1.3 * radius_m)
     for k in range(3):

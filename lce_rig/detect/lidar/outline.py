@@ -22,6 +22,7 @@ from lce_rig.detect.lidar.segments import Indices
 from lce_rig.detect.lidar.template import Placement
 
 N_ANGLES = 9
+# Share of rays on the wrong side of the border whatever its place; at 0 a single one would decide.
 _OUTLIERS = 0.02
 # Distance from the border beyond which rays do not locate it, m.
 _BAND_M = 0.10

@@ -308,7 +308,6 @@ def _penalty(found: LidarBoard, board: Board) -> float:
 
 
 MARGIN_M = 0.25  # margin of the searched box around the board, on every side
-LOOK_TURN = np.cos(np.radians(15.0))
 
 
 def look_for_board(
@@ -375,6 +374,6 @@ def _measure_at(
 
 
 def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
-    """Return whether a board is at a pose."""
+    """Return whether a board is within MARGIN_M and 15 deg of a pose."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
-    return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > LOOK_TURN
+    return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > np.cos(np.radians(15.0))

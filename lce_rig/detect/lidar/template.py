@@ -10,7 +10,7 @@ from lce_rig.core.geometry import Array, pose
 from lce_rig.detect.lidar.segments import MAX_STEPS, Floats, Indices, OrderedScan
 
 N_ANGLES = 12
-CAP_M = 0.10
+CAP_M = 0.10  # largest distance of a beam from the border that counts: farther outliers weigh no more
 MAX_SAMPLES = 64
 MIN_ON_RING = 3  # returns that make a chord
 DARK_DEPTH_M = 0.10  # maximum depth behind the plane measured for a dark square that a beam grazes

@@ -33,7 +33,6 @@ from lce_rig.show.page import render
 PAGE = "index.html"
 _WIDTH_IN = 16
 _TITLE_IN, _WIDE, _MANY = 0.3, 2.0, 600  # Height of a title; ratio of a wide image; edges drawn small.
-_FOLD_MARGIN = 0.9
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
 # Scans that choose the range scale of a session's images.
@@ -168,7 +167,7 @@ def _to_picture(
     pixels, _ = intrinsics.project(points_camera)
     # Near the radius where the distortion folds, pixels hardly move.
     rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
-    limit = _FOLD_MARGIN * intrinsics.max_radius
+    limit = 0.9 * intrinsics.max_radius
     is_clear = (
         np.arctan2(rho, z) < limit if intrinsics.model == "equidistant" else (z > 0) & (rho < limit * z)
     )

@@ -21,11 +21,6 @@ from lce_rig.session import Capture, Session
 from lce_rig.session.durable import write_atomically
 
 _WIDTH_PX, _HEIGHT_PX = 1600, 1000
-_FRUSTUM_M = 0.5
-_BEHIND_M, _ABOVE_M, _AHEAD_M = 1.6, 0.8, 2.0
-_NEAREST_M, _FARTHEST_M = 0.05, 300.0
-_UNSEEN, _GROUND, _FRUSTUM = (0.45, 0.47, 0.5), (0.06, 0.07, 0.08), (1.0, 0.7, 0.1)
-_POINT_PX = 4.0
 _HINT = "Install OpenGL and EGL (`apt install libgl1 libegl1`), or run on a computer with a display."
 _PICTURES = (".png", ".jpg", ".jpeg")
 _NEXT, _PREVIOUS = ord("N"), ord("P")
@@ -79,9 +74,9 @@ class CameraIn3D:
     T_cam_lidar: Array
 
     def frustum(self) -> tuple[Array, NDArray[np.int32]]:
-        """Return the camera and its field of view's corners (5, 3), frame lidar, and the lines (8, 2)."""
+        """Return the camera and its view's corners at 0.5 m (5, 3), frame lidar, and the lines (8, 2)."""
         rays = self.lens.unproject(outermost_pixels(self.lens))
-        corners = np.concatenate([np.zeros((1, 3)), _FRUSTUM_M * rays])
+        corners = np.concatenate([np.zeros((1, 3)), 0.5 * rays])
         edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 4), (4, 3), (3, 1)]
         return transform(invert(self.T_cam_lidar), corners), np.array(edges, np.int32)
 
@@ -160,7 +155,7 @@ def _opened(window: Any, *, is_visible: bool) -> Any:
 
 
 def _cloud(o3d: Any, capture: CaptureIn3D) -> Any:
-    colours = np.where(capture.is_seen[:, None], capture.colours / 255, _UNSEEN)
+    colours = np.where(capture.is_seen[:, None], capture.colours / 255, (0.45, 0.47, 0.5))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(capture.points.astype(np.float64)))
     cloud.colors = o3d.utility.Vector3dVector(colours)
     return cloud
@@ -173,25 +168,25 @@ def _fill(o3d: Any, window: Any, cloud: Any, cameras: Sequence[CameraIn3D]) -> N
     for camera in cameras:
         corners, edges = camera.frustum()
         lines = o3d.geometry.LineSet(o3d.utility.Vector3dVector(corners), o3d.utility.Vector2iVector(edges))
-        lines.paint_uniform_color(_FRUSTUM)
+        lines.paint_uniform_color((1.0, 0.7, 0.1))
         window.add_geometry(lines)
     options = window.get_render_option()
-    options.background_color, options.point_size = np.array(_GROUND), _POINT_PX
+    options.background_color, options.point_size = np.array([0.06, 0.07, 0.08]), 4.0
     _look_from_behind(o3d, window, invert(cameras[0].T_cam_lidar))
 
 
 def _look_from_behind(o3d: Any, window: Any, T_lidar_cam: Array) -> None:
     """Place the eye behind and above a camera; a distance in metres, as the cloud may reach far."""
     forward, up = T_lidar_cam[:3, 2], np.array([0.0, 0.0, 1.0])
-    eye = T_lidar_cam[:3, 3] - _BEHIND_M * forward + _ABOVE_M * up
-    z = T_lidar_cam[:3, 3] + _AHEAD_M * forward - eye
+    eye = T_lidar_cam[:3, 3] - 1.6 * forward + 0.8 * up
+    z = T_lidar_cam[:3, 3] + 2.0 * forward - eye
     z /= np.linalg.norm(z)
     x = np.cross(z, up) if abs(z @ up) < 0.99 else T_lidar_cam[:3, 0]
     x /= np.linalg.norm(x)
     view = window.get_view_control()
     # By default the view is clipped to the cloud's own size.
-    view.set_constant_z_near(_NEAREST_M)
-    view.set_constant_z_far(_FARTHEST_M)
+    view.set_constant_z_near(0.05)
+    view.set_constant_z_far(300.0)
     parameters = view.convert_to_pinhole_camera_parameters()
     parameters.extrinsic = invert(pose(np.stack([x, np.cross(z, x), z], axis=1), eye))
     view.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)

@@ -20,7 +20,6 @@ _KEYS: dict[str, Key | TakeBack] = {
     "n": "next",
     "u": TakeBack(),
 }
-_ENDING_S = 10.0
 HELP = "q stop   space capture now   u take back   n another place"
 PAGE_HELP = "   p QR code"
 """The key that shows the page's QR code, where there is a page."""
@@ -70,7 +69,7 @@ def controls() -> Iterator[Controls]:
         if is_interactive:
             tty.setcbreak(sys.stdin)
         # The first request ends it; captures that were decided on are written first.
-        with patience(_ENDING_S):
+        with patience(grace_s=10.0):
             yield asked
     finally:
         if settings is not None:
