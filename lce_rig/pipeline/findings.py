@@ -57,7 +57,7 @@ LIDAR_ABSENT = warning_kind(
 SENSOR_DISAGREES = warning_kind(
     "shortage.sensor_disagrees",
     "captures of {subject} agree with no other sensor's ({others})",
-    "check its clock and topic: its samples may be of other times, or of another board",
+    "check its clock and topic: samples may be of other times or boards",
 )
 CHANNEL_ABSENT = warning_kind(
     "shortage.channel_absent",
