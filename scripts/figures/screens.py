@@ -35,7 +35,7 @@ _COLOURS = {
 }  # fmt: skip
 
 
-def draw_screens(folder: Path, n_captures: int = 6) -> None:
+def draw_screens(folder: Path, n_captures: int = 4) -> None:
     """Collect with the simulated rig, and photograph the screens while the board has to move.
 
     Args:
