@@ -123,7 +123,7 @@ def with_motion(validation: Validation, pair: PairCosts, moved: MovedSensor | No
         return validation
     if pair.moved is not None:
         named = replace(pair.moved, figures={**pair.moved.figures, "sensor": moved.name})
-        causes = [named if each.code == MOVED.code else each for each in validation.causes]
+        causes = [named if each is pair.moved else each for each in validation.causes]
         return replace(validation, causes=causes)
     found, others = moved.finding(pair), list(validation.causes)
     if found.severity != "note":

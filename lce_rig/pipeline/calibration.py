@@ -5,7 +5,7 @@ detections -> estimate of each camera with each LiDAR, and of every two LiDARs o
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -37,7 +37,7 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.export.extrinsics import Reference
 from lce_rig.judge.findings import EXCHANGED, lacks_captures
-from lce_rig.judge.moved_sensor import MovedSensor, PairCosts, find_moved_sensor, with_motion
+from lce_rig.judge.moved_sensor import PairCosts, find_moved_sensor, with_motion
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
     CameraEvidence,
@@ -114,7 +114,7 @@ class _Solved:
 
     @property
     def costs(self) -> PairCosts:
-        """Findings about a motion of either sensor."""
+        """Costs of the captures, by which a motion of either sensor shows."""
         return PairCosts.of((self.camera, self.lidar), self.estimate, self.validation)
 
     def evidence(self, detections: Detections) -> CameraEvidence:
@@ -277,7 +277,8 @@ def calibrate_detections(
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
     if len(alone) + len(between) > 1:
         begin(progress, "comparing and joining sensors")
-    moved = find_moved_sensor([own.costs for own in alone] + [own.costs for own in between])
+    costs = [own.costs for own in alone] + [own.costs for own in between]
+    moved, excluded = find_moved_sensor(costs), set[SensorPair]()
     links, loops = _compare(rig, detections, alone), _open_loops(rig, alone, between)
     if moved is not None:
         # Contradictions of its pairs follow from its motion.
@@ -285,7 +286,8 @@ def calibrate_detections(
             link._replace(contradictions=[]) if moved.name in link.sensors(alone) else link for link in links
         ]
         loops = [(loop, finding) for loop, finding in loops if moved.name not in loop.names]
-    solved, between = _solve_together(rig, detections, alone, between, links, loops, moved)
+        excluded = {pair.sensors for pair in costs if moved.is_within(pair)}
+    solved, between = _solve_together(rig, detections, alone, between, links, loops, excluded)
     solved = [replace(own, validation=with_motion(own.validation, own.costs, moved)) for own in solved]
     between = [replace(own, validation=with_motion(own.validation, own.costs, moved)) for own in between]
     named = [(own.names, finding) for own in between for finding in find_named(rig, detections, own)]
@@ -489,14 +491,14 @@ def _solve_together(
     between: Sequence[SolvedPeers],
     links: Sequence[_Link],
     loops: Sequence[tuple[Loop, Finding]],
-    moved: MovedSensor | None,
+    excluded: Set[SensorPair],
 ) -> tuple[list[_Solved], list[SolvedPeers]]:
     """Estimate sensors that agree as one; leave the others unchanged.
 
     A sensor that contradicts another, or its own captures, is excluded, as it would corrupt the others'
-    extrinsics. So is method "paper", which gives the solution of Algorithm 1.
+    extrinsics. So are the pairs given as such, and method "paper", which gives Algorithm 1's solution.
     """
-    excluded = {pair for loop, _ in loops for pair in loop.pairs}
+    excluded = excluded | {pair for loop, _ in loops for pair in loop.pairs}
     excluded |= {
         (alone[k].camera, alone[k].lidar)
         for link in links
@@ -509,9 +511,6 @@ def _solve_together(
         if own.settings.method == "ml" and own.is_still and _is_sound(own.validation)
     }
     lidars = {own.names: own for own in between if _is_sound(own.validation)}
-    if moved is not None:
-        costs = [own.costs for own in alone] + [own.costs for own in between]
-        excluded |= {pair.sensors for pair in costs if moved.is_within(pair)}
     sound = (cameras.keys() | lidars.keys()) - excluded
     solved, solved_lidars = list(alone), list(between)
     for pairs in _connected(sound):

@@ -69,7 +69,7 @@ class SolvedPeers:
 
     @property
     def costs(self) -> PairCosts:
-        """What the captures say of a motion of either sensor."""
+        """Costs of the captures, by which a motion of either sensor shows."""
         return PairCosts.of(self.names, self.estimate, self.validation, self.T_view)
 
     @property
