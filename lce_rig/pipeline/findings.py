@@ -143,6 +143,12 @@ SCENE_DARK = Kind(
     "record by daylight, or expose longer",
     severity="warning",
 )
+SCENE_EVENTS_STAND = Kind(
+    "scene_calibration.events_of_standing_rig",
+    "cannot tell: events show only moving things, and the rig was not seen to move in {n_views} views",
+    "move the rig slowly past upright edges, or record images as well",
+    severity="warning",
+)
 SCENE_FEW_EDGES = Kind(
     "scene_calibration.few_edges",
     "cannot tell: {n_edges} edges of the scene in {n_views} views are too few",

@@ -5,18 +5,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from lce_rig.core.calibration import Calibration, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, PoseDifference
+from lce_rig.core.geometry import PoseDifference
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.judge.scene_drift import SceneDrift, watch_scene
+from lce_rig.pipeline.scene_samples import channel_of, picture_of, seconds_to_image
 from lce_rig.rig import Rig
 from lce_rig.scene.estimate import HOLDS_CHI2
 from lce_rig.scene.findings import (
@@ -28,17 +27,14 @@ from lce_rig.scene.findings import (
     NO_SAMPLES,
 )
 from lce_rig.scene.outline_score import OutlineView
-from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion
 from lce_rig.scene.views import build_view, evenly, without_board, without_movers
-from lce_rig.show.overlays.canvas import accumulated, write_picture
+from lce_rig.show.overlays.canvas import write_picture
 from lce_rig.show.overlays.overlay import draw_edges
-from lce_rig.timing.scan_pairing import event_channel, rig_time_ns
 
 _ORDER: tuple[State, ...] = ("changed", "unchanged", "unknown")
 _MIN_MOVING = 3
 _MAX_BOARDS = 20
-#: Of events this long about the time at which the LiDAR looks where the camera does.
-EVENTS_NS = 20_000_000
 
 
 class Seen(NamedTuple):
@@ -174,7 +170,8 @@ class PairJudge:
             view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
             motion = self._motion(seen)
             if motion is not None:
-                after_s = _after_s(view.outlines.points, seen, self._rig, c)
+                late_ns = own_offset_ns(c, channel_of(seen.image, self._rig))
+                after_s = seconds_to_image(view.outlines.points, seen.scan, seen.image, self._rig, late_ns)
                 if after_s is None:
                     n_untimed += 1
                     continue
@@ -207,9 +204,7 @@ class PairJudge:
             # The picture is of the capture with most edges.
             view = max(whole, key=lambda each: len(each.outlines))
             image = next(seen.image for seen in kept if seen.name == view.capture)
-            if isinstance(image, Events):
-                image = Image(image.sensor, "events", None, accumulated(image))
-            example = view.capture, image, view
+            example = view.capture, picture_of(image), view
         return PairDrift(c, judged, self._boards(c, boards), example)
 
     def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
@@ -233,19 +228,6 @@ class PairJudge:
             motion = estimate_motion(seen.previous, seen.scan)
             self._motions[key] = None if motion is None or motion.is_still else motion
         return self._motions[key]
-
-
-def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
-    """Compute the time from each edge (N, 3) to the image; None if times are unknown."""
-    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
-    image_ns = rig_time_ns(image, rig)
-    fired_s = firing_times_s(seen.scan, points)
-    if scan_ns is None or image_ns is None or fired_s is None:
-        return None
-    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
-    # Events are cut about their middle.
-    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
-    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
 
 
 def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> list[Finding]:

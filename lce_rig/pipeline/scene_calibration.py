@@ -7,7 +7,7 @@ LiDAR -> checks, verdict, overlays
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from lce_rig.core.calibration import BY_SCENE, MOTIONS, Calibration, Certificate, Metrics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import (
     NotEnoughDataError,
     ProfileError,
@@ -38,6 +38,7 @@ from lce_rig.pipeline.findings import (
     SCENE_AMBIGUOUS,
     SCENE_BEYOND_REACH,
     SCENE_DARK,
+    SCENE_EVENTS_STAND,
     SCENE_FEW_EDGES,
     SCENE_LENS,
     SCENE_MOVING,
@@ -49,6 +50,15 @@ from lce_rig.pipeline.findings import (
     SCENE_WEAK,
 )
 from lce_rig.pipeline.result_files import Result
+from lce_rig.pipeline.scene_samples import (
+    Thinned,
+    channel_of,
+    events_at_scans,
+    image_or_events,
+    picture_of,
+    read_events,
+    seconds_to_image,
+)
 from lce_rig.rig import NominalExtrinsic, Rig
 from lce_rig.scene.estimate import (
     MIN_SCORE,
@@ -58,13 +68,13 @@ from lce_rig.scene.estimate import (
     follow_lens,
 )
 from lce_rig.scene.outline_score import OutlineView, build_outline_view
-from lce_rig.scene.rig_motion import estimate_motion, firing_times_s
+from lce_rig.scene.rig_motion import RigMotion, estimate_motion
 from lce_rig.scene.views import evenly
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
 from lce_rig.show.overlays.canvas import write_picture
 from lce_rig.show.overlays.overlay import draw_edges
-from lce_rig.timing.scan_pairing import pair_by_time, rig_time_ns
+from lce_rig.timing.scan_pairing import EventCut, pair_by_time
 
 OVERLAYS = "scene"
 """Folder of the overlays in the session."""
@@ -83,13 +93,15 @@ class View:
     Attributes:
         name: of the capture that holds them.
         images, scans: of all sensors; scans as recorded.
+        events: of each event camera, while the scans were fired.
         previous: the scans before, by LiDAR; empty where the recording is not continuous.
     """
 
     name: str
     images: tuple[Image, ...]
     scans: tuple[Scan, ...]
-    previous: Mapping[str, Scan]
+    events: tuple[EventCut, ...] = ()
+    previous: Mapping[str, Scan] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,22 +230,6 @@ def _nominals(rig: Rig, cameras: Sequence[str]) -> list[NominalExtrinsic]:
     return found
 
 
-class _Spread(list[View]):
-    """Views spread over a stream of unknown length: every one, then every second, and so on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_taken, self._stride = 0, 1
-
-    def take(self, view: View) -> None:
-        if self._n_taken % self._stride == 0:
-            self.append(view)
-        self._n_taken += 1
-        if len(self) > _MOST_VIEWS:
-            self[:] = self[::2]
-            self._stride *= 2
-
-
 def _read(paths: Sequence[Path], rig: Rig, notes: list[str], progress: Progress) -> list[View]:
     """Read views of recordings; what is damaged is skipped with a note.
 
@@ -252,16 +248,19 @@ def _read(paths: Sequence[Path], rig: Rig, notes: list[str], progress: Progress)
 
 def _of_folder(recording: FolderRecording, notes: list[str], progress: Progress) -> Iterator[View]:
     for label, images, scans in read_pairs(evenly(recording.pairs, _MOST_VIEWS), notes, progress):
-        yield View(label, images, scans, {})
+        yield View(label, images, scans)
 
 
 def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> list[View]:
     require_sensors(recording, rig)
-    losses, kept = Losses(), _Spread()
+    losses, kept = Losses(), Thinned[View](_MOST_VIEWS)
     previous: dict[str, Scan] = {}
-    for frame in pair_by_time(read_samples(recording, rig, progress), rig, losses):
-        if frame.images and frame.scans:
-            kept.take(View(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, previous))
+    samples = read_samples(recording, rig, progress)
+    for frame in pair_by_time(samples, rig, losses, are_events_enough=True):
+        events = events_at_scans(frame.events, frame.scans, rig)
+        if frame.scans and (frame.images or events):
+            name = f"{1e-9 * frame.time_ns:.2f} s"
+            kept.take(View(name, frame.images, frame.scans, events, previous))
         previous = {scan.sensor: scan for scan in frame.scans}
     if not kept and losses.counts():
         (why, n), *_ = losses.counts()
@@ -286,8 +285,9 @@ def _store(views: Sequence[View], rig: Rig, path: Path) -> list[View]:
     named = []
     with Session.resume(path, rig) as session:
         for view in views:
-            name = session.find_duplicate(view.images, view.scans)
-            name = name or session.add_capture(view.images, view.scans, {_SCENE: view.name})
+            events = [cut.events for cut in view.events]
+            name = session.find_duplicate(view.images, view.scans, events)
+            name = name or session.add_capture(view.images, view.scans, {_SCENE: view.name}, events)
             named.append(replace(view, name=name))
     return named
 
@@ -297,7 +297,8 @@ def _stored(session: Session) -> Iterator[View]:
     for capture in evenly(session.captures, _MOST_VIEWS):
         with suppress(SessionError):
             images = tuple(capture.image(*key) for key in capture.image_keys)
-            yield View(capture.name, images, tuple(map(capture.scan, capture.lidars)), {})
+            scans = tuple(map(capture.scan, capture.lidars))
+            yield View(capture.name, images, scans, read_events(capture, session.rig))
 
 
 def calibrate_pair(
@@ -305,35 +306,44 @@ def calibrate_pair(
 ) -> tuple[Calibration | Finding, list[Drawn]]:
     """Estimate and judge the extrinsics of one camera and LiDAR; a finding where the scene cannot tell."""
     camera, lidar, T_nominal = nominal.camera, nominal.lidar, nominal.to_matrix()
-    lens, channel = rig.cameras[camera].to_intrinsics(), rig.cameras[camera].first_channel("frames")
-    settings = rig.lidars[lidar]
+    lens, settings = rig.cameras[camera].to_intrinsics(), rig.lidars[lidar]
     beam = Beam(settings.beam_aperture_m, settings.beam_divergence_rad)
     outlined: list[OutlineView] = []
-    images: list[Image] = []
-    n_moving = 0
+    images: list[Image | Events] = []
+    n_untimed, is_standing = 0, True
     for view in views:
-        image = next((each for each in view.images if (each.sensor, each.channel) == (camera, channel)), None)
         scan = next((rig.corrected(each) for each in view.scans if each.sensor == lidar), None)
-        if image is None or scan is None:
+        if scan is None:
             continue
-        outlines = build_outline_view(view.name, image, scan, beam, lens, T_nominal)
-        built = _at_image(rig, view, image, scan, outlines)
-        if built is None:
-            n_moving += 1
+        image = image_or_events(rig, camera, view.images, view.events, scan, lens, T_nominal)
+        if image is None:
             continue
+        built = build_outline_view(view.name, image, scan, beam, lens, T_nominal)
+        motion = _motion(rig, view, scan)
+        if motion is not None:
+            is_standing = False
+            after_s = seconds_to_image(built.outlines.points, scan, image, rig)
+            if after_s is None:
+                n_untimed += 1
+                continue
+            points = motion.moved(built.outlines.points, after_s)
+            built = replace(built, outlines=replace(built.outlines, points=points))
         outlined.append(built)
         images.append(image)
     subject = f"{camera} and {lidar}"
     if not outlined:
-        return (SCENE_MOVING if n_moving else SCENE_NO_VIEWS)(subject, n_views=n_moving), []
+        return (SCENE_MOVING if n_untimed else SCENE_NO_VIEWS)(subject, n_views=n_untimed), []
     estimate = estimate_scene(outlined, lens, T_nominal)
     shortage = _shortage(subject, estimate, images)
+    if shortage is not None and is_standing and any(isinstance(each, Events) for each in images):
+        shortage = SCENE_EVENTS_STAND(subject, n_views=len(outlined))
+    pictures = [picture_of(image) for image in images]
     if shortage is None:
         change = find_better_focal(outlined, lens, estimate.T_cam_lidar)
         if change is not None:
             shortage = SCENE_LENS(subject, change=100 * change, n_views=len(outlined))
     poses = {"nominal": T_nominal} | ({} if shortage else {"estimated": estimate.T_cam_lidar})
-    drawn = [Drawn(camera, lidar, *each, poses) for each in zip(images, outlined, strict=True)]
+    drawn = [Drawn(camera, lidar, *each, poses) for each in zip(pictures, outlined, strict=True)]
     if shortage is not None:
         return shortage, drawn
     cov, cross, cov_lens = _with_lens(rig, camera, outlined, estimate)
@@ -341,7 +351,7 @@ def calibrate_pair(
     names = tuple(view.capture for view in outlined)
     calibration = Calibration(
         camera=camera,
-        channels=(channel or "",),
+        channels=(channel_of(images[0], rig),),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
         cov=cov,
@@ -358,7 +368,7 @@ def calibrate_pair(
         intrinsics_cov=cov_lens,
         intrinsics_cross_cov=cross,
     )
-    findings = [*_findings(rig, nominal, estimate, n_moving), *_one_place(subject, images)]
+    findings = [*_findings(rig, nominal, estimate, n_untimed), *_one_place(subject, pictures)]
     return with_findings(calibration, findings), drawn
 
 
@@ -379,23 +389,17 @@ def _with_lens(
     return np.asarray(estimate.cov + used @ used.T), np.asarray(used @ changes.T), cov_lens
 
 
-def _at_image(rig: Rig, view: View, image: Image, scan: Scan, built: OutlineView) -> OutlineView | None:
-    """Move outlines to the image's time if the rig moves; None where times are unknown."""
+def _motion(rig: Rig, view: View, scan: Scan) -> RigMotion | None:
+    """Estimate the rig's motion at a view; None if it stands still or cannot be estimated."""
     previous = view.previous.get(scan.sensor)
     motion = None if previous is None else estimate_motion(rig.corrected(previous), scan)
-    if motion is None or motion.is_still:
-        return built
-    scan_ns, image_ns = rig_time_ns(scan, rig), rig_time_ns(image, rig)
-    fired_s = firing_times_s(scan, built.outlines.points)
-    if scan_ns is None or image_ns is None or fired_s is None:
-        return None
-    points = motion.moved(built.outlines.points, 1e-9 * (image_ns - scan_ns) - fired_s)
-    return replace(built, outlines=replace(built.outlines, points=points))
+    return None if motion is None or motion.is_still else motion
 
 
-def _shortage(subject: str, estimate: SceneEstimate, images: Sequence[Image]) -> Finding | None:
+def _shortage(subject: str, estimate: SceneEstimate, images: Sequence[Image | Events]) -> Finding | None:
     """Name why the scene cannot tell; None if it can."""
-    brightest = max(float(np.percentile(image.grey, 99)) for image in images)
+    greys = (float(np.percentile(image.grey, 99)) for image in images if isinstance(image, Image))
+    brightest = max(greys, default=math.inf)
     figures: dict[str, Any] = {"n_views": len(images), "n_edges": estimate.n_edges}
     if estimate.state != "usable" and brightest < _DARK:
         return SCENE_DARK(subject, grey_99=brightest, limit=_DARK, **figures)
@@ -427,7 +431,7 @@ def _one_place(subject: str, images: Sequence[Image]) -> list[Finding]:
 
 
 def _findings(
-    rig: Rig, nominal: NominalExtrinsic, estimate: SceneEstimate, n_moving: int
+    rig: Rig, nominal: NominalExtrinsic, estimate: SceneEstimate, n_untimed: int
 ) -> Iterator[Finding]:
     """List what keeps extrinsics from a pass."""
     subject = f"{nominal.camera} and {nominal.lidar}"
@@ -446,5 +450,5 @@ def _findings(
     if nominal.source == "typical":
         yield SCENE_TYPICAL(subject)
     yield from nominal_findings(estimate.T_cam_lidar, nominal)
-    if n_moving:
-        yield SCENE_MOVING(subject, severity="note", n_views=n_moving)
+    if n_untimed:
+        yield SCENE_MOVING(subject, severity="note", n_views=n_untimed)

@@ -7,16 +7,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
-
-import numpy as np
 
 from lce_rig.collect.live.frame_feed import FrameFeed
-from lce_rig.core.calibration import Calibration, ResultFile, read_result
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.calibration import ResultFile, read_result
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.findings import Losses
-from lce_rig.core.geometry import transform
 from lce_rig.core.progress import Progress, silent
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
@@ -24,41 +20,15 @@ from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording, read_pairs
 from lce_rig.io.recording import ContinuousRecording, join_recordings, read_samples, require_sensors
-from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, PairJudge, Seen, own_offset_ns
+from lce_rig.pipeline.pair_drift import DriftReport, PairJudge, Seen, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
+from lce_rig.pipeline.scene_samples import Thinned, image_or_events, read_events
 from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
 from lce_rig.scene.views import MAX_CAPTURES, evenly
 from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
-from lce_rig.timing.scan_pairing import (
-    EventCut,
-    Frame,
-    event_channel,
-    pair_by_time,
-    rig_offset_ns,
-    rig_time_ns,
-    stream_of,
-)
-
-_Item = TypeVar("_Item")
-
-
-class Thinned(list[_Item]):
-    """The items of a stream, every one at first, every second once there are too many, and so on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_taken, self._stride = 0, 1
-
-    def take(self, item: _Item) -> None:
-        """Keep an item if it is its turn."""
-        if self._n_taken % self._stride == 0:
-            self.append(item)
-        self._n_taken += 1
-        if len(self) > MAX_CAPTURES:
-            self[:] = self[::2]
-            self._stride *= 2
+from lce_rig.timing.scan_pairing import EventCut, Frame, event_channel, pair_by_time
 
 
 class SceneCaptures:
@@ -94,7 +64,7 @@ class SceneCaptures:
                 raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
         self._rig, self._source = rig, source
         self._pairs = of_cameras
-        self.kept: list[Thinned[Seen]] = [Thinned() for _ in of_cameras]
+        self.kept: list[Thinned[Seen]] = [Thinned(MAX_CAPTURES) for _ in of_cameras]
         self.notes: list[str] = []
         self._last: dict[str, Scan] = {}
 
@@ -107,13 +77,7 @@ class SceneCaptures:
             with suppress(SessionError):  # A damaged one is skipped.
                 images = [capture.image(*key) for key in capture.image_keys if key[0] in cameras]
                 scans = [capture.scan(lidar) for lidar in capture.lidars if lidar in lidars]
-                cuts = []
-                for camera in cameras.intersection(capture.event_cameras):
-                    if len(events := capture.events(camera)):
-                        offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
-                        first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
-                        cuts.append(EventCut((events,), first_ns, last_ns + 1, offset_ns, 0))
-                self._take(capture.name, images, scans, cuts)
+                self._take(capture.name, images, scans, read_events(capture, self._rig))
 
     def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
         """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
@@ -179,18 +143,16 @@ class SceneCaptures:
     ) -> None:
         for c, kept in zip(self._pairs, self.kept, strict=True):
             scan = next((each for each in scans if each.sensor == c.lidar), None)
-            own = [image for image in images if image.sensor == c.camera]
-            # Frames before images that were made of events.
-            frames = self._rig.cameras[c.camera].first_channel("frames")
-            own = [image for image in own if image.channel == frames] or own
             if scan is None:
                 continue
             scan = self._rig.corrected(scan)
-            # Grey: colour is not used, and would hold three times the memory.
-            image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
-            if image is None:
-                cut = next((each for each in events if each.sensor == c.camera), None)
-                image = None if cut is None else _about_scan(cut, scan, self._rig, c)
+            late_ns = own_offset_ns(c, event_channel(self._rig, c.camera) or "")
+            image = image_or_events(
+                self._rig, c.camera, images, events, scan, self._rig.lens_of(c), c.T_cam_lidar, late_ns
+            )
+            if isinstance(image, Image):
+                # Grey: colour is not used, and would hold three times the memory.
+                image = replace(image, pixels=image.grey)
             if image is not None:
                 kept.take(Seen(name, image, scan, self._last.get(c.lidar)))
 
@@ -209,25 +171,6 @@ class SceneCaptures:
             )
         pairs = tuple(map(PairJudge(self._rig).pair, self._pairs, self.kept))
         return DriftReport(self._rig, pairs, tuple(dict.fromkeys(self.notes)))
-
-
-def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
-    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
-    scan_ns = rig_time_ns(scan, rig)
-    if scan_ns is None or scan.offset_ns is None or not len(scan.points):
-        return None
-    lens = rig.lens_of(c)
-    pixels, is_valid = lens.project(transform(c.T_cam_lidar, scan.points))
-    is_seen = is_valid & lens.is_inside(pixels)
-    if not is_seen.any():
-        return None
-    offset_ns = cut.offset_ns + own_offset_ns(c, event_channel(rig, c.camera) or "")
-    middle_ns = scan_ns + int(np.median(scan.offset_ns[is_seen])) - offset_ns
-    events = cut.events.between(middle_ns - EVENTS_NS // 2, middle_ns + EVENTS_NS // 2)
-    if not len(events):
-        return None
-    columns = {name: getattr(events, name).copy() for name in ("t_ns", "x", "y", "polarity")}
-    return replace(events, **columns)
 
 
 def drift(

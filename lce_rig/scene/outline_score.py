@@ -15,6 +15,9 @@ from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outline
 
 _BESIDE_RAD = 0.06  # Margin of the image in which outlines are kept: other extrinsics bring them in.
 _NEAREST_M = 0.5  # in front of the camera
+_EVENTS_NEAR_RAD = (
+    0.06  # Edges without events nearer than this are not used: as far as the score is searched.
+)
 _MAX_EDGES = 4000  # of one view; more add time and, of one view, hardly any information
 _COLUMNS, _ROWS = 8, 3  # Blocks of the image
 
@@ -54,10 +57,12 @@ def build_outline_view(
     if len(outlines) > _MAX_EDGES:
         outlines = outlines.select(np.linspace(0, len(outlines) - 1, _MAX_EDGES).round().astype(np.intp))
     if isinstance(image, Image):
-        pyramid = build_edge_pyramid(image.grey, intrinsics.fx_px)
-    else:
-        pyramid = build_event_pyramid(image, intrinsics.fx_px)
-    return OutlineView(capture, outlines, pyramid)
+        return OutlineView(capture, outlines, build_edge_pyramid(image.grey, intrinsics.fx_px))
+    pyramid = build_event_pyramid(image, intrinsics.fx_px)
+    # Edges without events about them stand still before a standing rig: they say nothing.
+    pixels, _ = intrinsics.project(transform(T_cam_lidar, outlines.points))
+    has_events = pyramid.has_edges_near(pixels, _EVENTS_NEAR_RAD * intrinsics.fx_px)
+    return OutlineView(capture, outlines.select(has_events), pyramid)
 
 
 class OutlineScore:

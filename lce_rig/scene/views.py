@@ -22,7 +22,6 @@ _Item = TypeVar("_Item")
 MAX_CAPTURES = 60
 """More captures add time and memory but, of one place, no information: they are thinned out evenly."""
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
-_EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.05, 0.01  # noise of ranges; azimuth steps
 _MAX_COMPARED = 10  # More captures of one place add no information.
 _STANDING_SHARE = 0.5  # of all edges that recur before a standing rig
@@ -34,13 +33,7 @@ def build_view(
     """Find the edges of one capture's scan, and of its image or of events about the scan."""
     lidar, lens = rig.lidars[extrinsics.lidar], rig.lens_of(extrinsics)
     beam = Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad)
-    view = build_outline_view(name, image, scan, beam, lens, extrinsics.T_cam_lidar)
-    if isinstance(image, Image):
-        return view
-    # Edges without events about them stand still before a standing rig: they say nothing.
-    pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, view.outlines.points))
-    has_events = view.pyramid.has_edges_near(pixels, _EVENTS_NEAR_RAD * lens.fx_px)
-    return replace(view, outlines=view.outlines.select(has_events))
+    return build_outline_view(name, image, scan, beam, lens, extrinsics.T_cam_lidar)
 
 
 def without_board(

@@ -92,6 +92,15 @@ class EventCut:
         """The camera."""
         return self.packets[0].sensor
 
+    def between(self, start_ns: int, end_ns: int) -> "EventCut | None":
+        """Narrow it to start_ns <= t < end_ns, the rig's time; None without an event."""
+        start_ns = max(start_ns - self.offset_ns, self.start_ns)
+        end_ns = min(end_ns - self.offset_ns, self.end_ns)
+        packets = _packets_between(self.packets, start_ns, end_ns)
+        if not packets:
+            return None
+        return replace(self, packets=packets, start_ns=start_ns, end_ns=end_ns, missing_ns=0)
+
     def __len__(self) -> int:
         return len(self.events)
 
@@ -134,11 +143,16 @@ class EventBuffer:
         cuts = []
         for _, stream in sorted(self._streams.items()):
             first_ns, end = start_ns - stream.offset_ns, end_ns - stream.offset_ns
-            packets = tuple(p for p in stream.packets if p.t_ns[-1] >= first_ns and p.t_ns[0] < end)
-            if any(len(packet.between(first_ns, end)) for packet in packets):
+            if packets := _packets_between(stream.packets, first_ns, end):
                 missing_ns = max(0, stream.first_ns - first_ns)
                 cuts.append(EventCut(packets, first_ns, end, stream.offset_ns, missing_ns))
         return tuple(cuts)
+
+
+def _packets_between(packets: Iterable[Events], start_ns: int, end_ns: int) -> tuple[Events, ...]:
+    """Return the packets that reach into start_ns <= t < end_ns; none without an event in it."""
+    near = tuple(p for p in packets if p.t_ns[-1] >= start_ns and p.t_ns[0] < end_ns)
+    return near if any(len(packet.between(start_ns, end_ns)) for packet in near) else ()
 
 
 class _Stream:

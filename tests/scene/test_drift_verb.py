@@ -18,7 +18,8 @@ from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.pipeline.watch_drift import SceneCaptures, Thinned, drift
+from lce_rig.pipeline.scene_samples import Thinned
+from lce_rig.pipeline.watch_drift import SceneCaptures, drift
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.session import Session
 from lce_rig.timing.scan_pairing import EventCut, Frame
@@ -153,7 +154,7 @@ def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, 
 
 def test_long_recordings_are_thinned_evenly_while_they_are_read():
     for n in (59, 60, 61, 1000):
-        kept = Thinned()
+        kept = Thinned(60)
         for number in range(n):
             kept.take(number)
         assert 30 <= len(kept) <= 60

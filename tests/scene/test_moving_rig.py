@@ -120,7 +120,7 @@ def calibrated(driven, change=lambda scan: scan):
         camera="cam", lidar="lidar", matrix=off[:3, :3].tolist(), translation_m=off[:3, 3].tolist()
     )
     views = [
-        View(str(k), (image,), (change(scan),), {"lidar": before})
+        View(str(k), (image,), (change(scan),), previous={"lidar": before})
         for k, (_, before, scan, image) in enumerate(driven)
     ]
     return calibrate_pair(rig.stage.rig, nominal, views)[0]
