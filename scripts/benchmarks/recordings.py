@@ -70,6 +70,7 @@ SETS = (
     RecordedSet("vlp32c_right", "vlp32c_stereo/right.yaml", (("vlp32c_stereo/right", "frames"),)),
     RecordedSet("vlp16_tilted", "vlp16_tilted/rig.yaml", (("vlp16_tilted", "frames"),)),
     RecordedSet("os1_gen1", "os1_gen1/rig.yaml", (("os1_gen1", "frames"),)),
+    RecordedSet("livox_avia", str(RIGS / "livox_avia.yaml"), (("livox_avia", "frames"),)),
 )
 
 

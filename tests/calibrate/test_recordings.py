@@ -1,6 +1,7 @@
 """Recordings by others: the extrinsic against their reference, which the algorithm never sees."""
 
 import json
+from pathlib import Path
 from typing import get_args
 
 import cv2
@@ -20,9 +21,10 @@ from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
 from lce_rig.io.cloud import rings_from_elevation, to_scan
 from lce_rig.judge.validate import validate
-from lce_rig.rig import load_rig, parse_rig
+from lce_rig.rig import load_rig
 
 pytestmark = pytest.mark.dataset
+AVIA = Path(__file__).parents[1] / "rigs" / "livox_avia.yaml"
 
 
 def read_scan(path):
@@ -98,26 +100,9 @@ def test_random_halves_of_a_recording_agree(recordings):
     assert distance_m <= 0.008
 
 
-AVIA = """
-format_version: 1
-name: avia
-board: {inner_corners: [12, 8], square_m: 0.080, width_m: 1.08, height_m: 0.76}
-lidars: {lidar: {model: Avia, max_range_m: 12}}
-cameras:
-  cam:
-    resolution_px: [1920, 1080]
-    intrinsics:
-      fx_px: 1368.68
-      fy_px: 1370.67
-      cx_px: 954.813
-      cy_px: 566.002
-      distortion: [0.0359136, 0.953307, 0.00153321, -0.00157993]
-"""
-
-
 @pytest.mark.long
 def test_recording_avia_halves_agree(recordings):
-    rig = parse_rig(AVIA)
+    rig = load_rig(str(AVIA))
     finder, lidar, seen = BoardFinder(rig), rig.lidars["lidar"], []
     for path in sorted((recordings / "livox_avia" / "img").glob("*.jpg")):
         image = finder.image(Image("cam", "frames", None, cv2.imread(str(path))))
