@@ -6,8 +6,8 @@
     estimate_motion      time offsets and motion of the boards: one pose of the board at the time of each scan
     solve                Algorithm 1: extrinsics from planes and ring ends, certified, without outliers
     maximise_likelihood  method "ml": extrinsics, board poses and constant errors of maximum likelihood
-    by_scatter,
-    by_likelihood        uncertainty
+    by_likelihood,
+    by_algorithm_1       uncertainty
 
 Channels of one camera, frames and events, share pixels and lens, not their times. Together they give one set
 of extrinsics; two are compared by Algorithm 1, as a camera has one pose.
@@ -30,7 +30,7 @@ from lce_rig.calibrate.observations import Clocks, join_scans
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.session_lens import fit_session_lens
-from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
+from lce_rig.calibrate.uncertainty import by_algorithm_1, by_likelihood
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
@@ -161,7 +161,7 @@ def estimate_observations(
         [start.observations], board, [start.T_cam_lidar], priors, usual, lenses=[settings.lens]
     )
     if settings.method == "paper":
-        return by_scatter(start, joint, board, settings)
+        return by_algorithm_1(start, joint, board, settings.lens)
     return by_likelihood(start, joint, board, settings.lens)
 
 

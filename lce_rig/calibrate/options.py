@@ -1,7 +1,6 @@
 """Options of a calibration, and the profile's settings of the LiDAR, the lens and the board."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,6 @@ from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.geometry import Array
 from lce_rig.lens.models import LensPrior
 from lce_rig.rig import BoardSettings, CameraSettings, LidarIntrinsicsSettings, LidarSettings
-
-Source = Literal["intrinsics", "square_size", "pattern_offset", "plate_size", "board_bow"]
 
 # As a fraction of a square, where a profile states none: two millimetres in a metre.
 _SQUARE = 2e-3
@@ -47,16 +44,6 @@ class Tolerances:
             plate_m=board.plate_sigma_m,
             bow_m=board.bow_sigma_m,
         )
-
-    def sigma(self, source: Source) -> float:
-        """Return the standard deviation of a source, in its own unit; errors of a lens have unit size."""
-        return {
-            "intrinsics": 1.0,
-            "square_size": self.square_size,
-            "pattern_offset": self.pattern_offset_m,
-            "plate_size": self.plate_m,
-            "board_bow": self.bow_m,
-        }[source]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,9 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, PoseDifference, rotation_angle, sigma_sizes
 from lce_rig.core.results import ImageBoard, Observation
 
+BY_ALGORITHM_1 = "algorithm_1"
+"""Source of the difference of Algorithm 1's solution from the likelihood's estimate."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
@@ -72,7 +75,6 @@ class CalibrationEstimate:
         refused: why each other capture is not used.
         observations: capture -> the boards that were paired, as measured, for each capture used, sorted; one
             stands for all that hold the same scan.
-        fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
         residuals: one per capture used, in the order of `observations`.
         diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
@@ -94,7 +96,6 @@ class CalibrationEstimate:
     certificate: Certificate
     refused: Mapping[str, Refusal]
     observations: Mapping[str, Observation]
-    fitted: Mapping[str, Observation]
     residuals: tuple[CaptureResidual, ...]
     diagnostics: Diagnostics
     method: str = "paper"
@@ -155,21 +156,22 @@ def report(
         n_placements=float(group_placements(start.observations).max() + 1),
     )
     refused = dict(sorted(start.refused.items()))
-    return CalibrationEstimate(
-        T_cam_lidar, cov, start.certificate, refused, observations, observations, residuals, figures
-    )
+    return CalibrationEstimate(T_cam_lidar, cov, start.certificate, refused, observations, residuals, figures)
+
+
+SIGMAS_OF_PARTS = (
+    "sigma_scatter_rotation_deg",
+    "sigma_scatter_translation_m",
+    "sigma_systematic_rotation_deg",
+    "sigma_systematic_translation_m",
+)
+"""Diagnostics of both parts of a covariance, by the captures' scatter and by constant errors."""
 
 
 def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagnostics:
     """Add the sizes of both parts of a covariance, each (6 + k, 6 + k)."""
-    (scatter_deg, scatter_m), (systematic_deg, systematic_m) = map(sigma_sizes, (scatter, systematic))
-    return replace(
-        figures,
-        sigma_scatter_rotation_deg=scatter_deg,
-        sigma_scatter_translation_m=scatter_m,
-        sigma_systematic_rotation_deg=systematic_deg,
-        sigma_systematic_translation_m=systematic_m,
-    )
+    sizes = (*sigma_sizes(scatter), *sigma_sizes(systematic))
+    return replace(figures, **dict(zip(SIGMAS_OF_PARTS, sizes, strict=True)))
 
 
 def lever_arm(observations: Sequence[Observation]) -> float:

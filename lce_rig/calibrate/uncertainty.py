@@ -1,27 +1,20 @@
 """Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
-from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.layout import SHIFTS, State
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.rays import correct_points
-from lce_rig.calibrate.options import EstimateSettings, Source, Tolerances
-from lce_rig.calibrate.plane_and_ends import (
-    differentiate,
-    end_rows,
-    extract_features,
-    plane_residuals,
-)
+from lce_rig.calibrate.plane_and_ends import extract_features, plane_residuals
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import (
+    BY_ALGORITHM_1,
+    SIGMAS_OF_PARTS,
     CalibrationEstimate,
     Sensitivity,
     Start,
@@ -33,172 +26,36 @@ from lce_rig.calibrate.result import (
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
-from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.geometry import Array, difference
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
 
 
-def by_scatter(
-    start: Algorithm1, joint: JointEstimate, board: Board, settings: EstimateSettings
+def by_algorithm_1(
+    start: Start, joint: JointEstimate, board: Board, lens: SessionLens | None
 ) -> CalibrationEstimate:
-    """Report Algorithm 1's solution: covariance from the scatter of captures, and from the LiDAR's errors.
+    """Report Algorithm 1's solution: its error is at most the likelihood's and the difference of both.
 
     Args:
         start: the solution.
-        joint: estimate from it, of which the boards' turns are reported.
+        joint: estimate from it.
         board: its specification.
-        settings: priors and tolerances.
+        lens: of the camera; None if exact.
     """
-    scatter = start.cost.jackknife_covariance()
-    by_lasers, by_bow, by_plate = moves_by_scans(start, board)
-    lasers, offset = systematic_covariances(
-        by_lasers.T, settings.laser_bias_sigma_m, settings.range_offset_sigma_m
-    )
-    systematic = lasers + offset
-    cov = scatter + systematic
-    figures = replace(start.diagnostics, edge_shift_sigma_m=float(np.sqrt(cov[6, 6])))
-    figures = with_parts(figures, scatter, systematic)
-    estimate = report(start, start.T_cam_lidar, cov[:6, :6], board, figures)
-    sensitivities: tuple[Sensitivity, ...] = ()
-    cov_with_lens = np.zeros((6, 0))
-    if settings.tolerances is not None:
-        sensitivities, cov_with_lens = _sensitivities(
-            start,
-            board,
-            settings.tolerances,
-            settings.lens,
-            {"plate_size": by_plate[:, :6], "board_bow": by_bow[:, :6]},
-        )
+    likely = by_likelihood(start, joint, board, lens)
+    apart = difference(start.T_cam_lidar, likely.T_cam_lidar)
+    of_both = ("edge_shift_sigma_m", *SIGMAS_OF_PARTS)
+    figures = replace(start.diagnostics, **{name: getattr(likely.diagnostics, name) for name in of_both})
+    estimate = report(start, start.T_cam_lidar, likely.cov, board, figures)
     return replace(
-        estimate,
-        fitted={observation.capture: observation for observation in start.fitted},
-        sensitivities=sensitivities,
-        lens=settings.lens,
-        cov_with_lens=cov_with_lens,
-        joint=(joint, 0),
+        likely,
+        T_cam_lidar=estimate.T_cam_lidar,
+        residuals=estimate.residuals,
+        diagnostics=estimate.diagnostics,
+        method="paper",
+        sensitivities=(*likely.sensitivities, Sensitivity(BY_ALGORITHM_1, 1.0, apart[None])),
     )
-
-
-def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array]:
-    """Differentiate the solution by constant errors of the scans and the plate, by one Newton step.
-
-    With half gradient g and half Hessian H of the cost, both at the solution, an error b moves the minimum by
-
-        s b = -H^-1 sum_k dg_k/db b                                                                      (1)
-
-    Ranges that err lift the plane that is fitted to a board's points, by a + b x + c y fitted to their errors
-    along its normal. Points lie on that plane, ring ends where their rays meet it. To first order an offset
-    common to all rings moves the minimum by the sum of those of each.
-
-    Args:
-        start: the solution; its association is held.
-        board: its specification.
-
-    Returns:
-        Tangents (translation m, rotation rad, edge shift m) per m of an error: (L, 7) by the range offset of
-        each ring seen; (2, 7) by the height of the plate's middle over its ends, along its width and its
-        height; (2, 7) by the plate's width and height, as the profile says them.
-    """
-    rings = np.unique(np.concatenate([o.lidar.ring for o in start.fitted]))
-    T, weights, keep = start.T_cam_lidar, start.problem.weights, start.problem.keep
-    L, changes = len(rings), np.zeros((len(rings) + 4, 7))
-    for k, observation in enumerate(start.fitted):
-        f, lidar = extract_features(observation, board), observation.lidar
-        normal, T_board_lidar = lidar.plane[:3], invert(lidar.T_lidar_board)
-        on_plate = _one_x_y(T_board_lidar, lidar.points)
-        rays = lidar.points / np.linalg.norm(lidar.points, axis=1, keepdims=True)
-        rises = [(rays @ normal)[:, None] * (lidar.ring[:, None] == rings)]
-        rises.append(1 - (on_plate[:, 1:] / (board.width_m / 2, board.height_m / 2)) ** 2)
-        lifted = np.linalg.lstsq(on_plate, np.hstack(rises), rcond=None)[0]
-        points = f.plane_points if keep is None else f.plane_points[keep[k]]
-        J = np.zeros((len(points), 7))
-        J[:, :6] = differentiate(f.normal, points @ T[:3, :3].T)
-        by_lift = -weights.plane / max(len(points), 1) * J.T @ _one_x_y(T_board_lidar, points)
-        _, J_end, edge = end_rows(f, T)
-        J_end *= weights.edge / max(len(edge), 1)
-        outwards = np.sum(f.edge_normals[edge] * (f.edge_points @ T[:3, :3].T), axis=1)
-        sideways = (outwards / (f.edge_points @ normal))[:, None]
-        by_lift -= J_end.T @ (sideways * _one_x_y(T_board_lidar, f.edge_points))
-        changes[: L + 2] += (by_lift @ lifted).T
-        # Of a wider plate, either edge lies half as much farther out.
-        changes[L + 2 :] += np.abs(board.edges()[1][edge, :2]).T @ J_end / 2
-    moves = -changes @ symmetric_inverse(start.cost.information)
-    return moves[:L], moves[L : L + 2], moves[L + 2 :]
-
-
-def _one_x_y(T_board_lidar: Array, points: Array) -> Array:
-    """List 1, x and y on the board of points (N, 3) of the LiDAR: (N, 3)."""
-    return np.column_stack([np.ones(len(points)), transform(T_board_lidar, points)[:, :2]])
-
-
-def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
-    """Compute how far moves of the boards' poses in the images (n, F, 6) move the solution: (n, 6).
-
-    A board that moves by (d, phi) looks to the LiDAR as if the extrinsics moved by
-    (-d - phi x (t - c), -phi), c the board's place.
-    """
-    levers = start.T_cam_lidar[:3, 3] - [o.pose.T_cam_board[:3, 3] for o in start.fitted]
-    shifts = -moves[:, :, :3] - np.cross(moves[:, :, 3:], levers)
-    alike = np.concatenate([shifts, -moves[:, :, 3:]], axis=2)
-    changes = np.einsum("kij,nkj->ni", start.cost.hessians[:, :, :6], alike)
-    return np.asarray(-changes @ symmetric_inverse(start.cost.information)[:, :6])
-
-
-def _sensitivities(
-    start: Algorithm1,
-    board: Board,
-    known: Tolerances,
-    lens: SessionLens | None,
-    of_scans: Mapping[Source, Array],
-) -> tuple[tuple[Sensitivity, ...], Array]:
-    """Collect the moves of Algorithm 1's solution by errors of lens and board.
-
-    Args:
-        start: the solution.
-        board: as the profile says.
-        known: standard deviations of the errors.
-        lens: of the session; None leaves its errors out.
-        of_scans: by source the moves (n, 6) of the result by other errors.
-
-    Returns:
-        The moves, and the cross-covariance (6, P) of extrinsics and intrinsics.
-    """
-    boards = [observation.image for observation in start.fitted]
-    images = stack_images(np.arange(len(boards)), boards, board.pattern_offset_m, lens)
-    by_error = _moves_by_poses(start, np.moveaxis(images.errors, -1, 0))
-    # The extrinsics are used with the intrinsics of the same result: the joint effect of both errors counts.
-    by_lens = by_error[3:] + np.pad(images.turns.T, ((0, 0), (3, 0)))
-    moves: dict[Source, Array] = {"square_size": by_error[:1], "pattern_offset": by_error[1:3]}
-    if lens is not None:
-        moves["intrinsics"] = by_lens
-    moves |= of_scans
-    found = tuple(Sensitivity(source, known.sigma(source), each) for source, each in moves.items())
-    return found, by_lens.T @ images.of_lens
-
-
-def systematic_covariances(
-    sensitivities: Array, sigma_each: float, sigma_common: float
-) -> tuple[Array, Array]:
-    """Propagate errors common to all groups, which the scatter between groups cannot show.
-
-    Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
-    moves the estimate by s_r for each unit. Independent deviations less their mean leave
-
-        cov = sigma_each^2 sum_r (s_r - s) (s_r - s)^T + sigma_common^2 L^2 s s^T,   s = sum_r s_r / L
-
-    Args:
-        sensitivities: (..., p, L) s_r in columns.
-        sigma_each: standard deviation of e_r, before their mean is subtracted.
-        sigma_common: standard deviation of e.
-
-    Returns:
-        Its two terms (..., p, p).
-    """
-    common = sensitivities.sum(axis=-1, keepdims=True)
-    each = sensitivities - sensitivities.mean(axis=-1, keepdims=True)
-    of_each = sigma_each**2 * each @ np.swapaxes(each, -1, -2)
-    return of_each, sigma_common**2 * common @ np.swapaxes(common, -1, -2)
 
 
 def by_likelihood(

@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.calibrate.likelihood.hypothesis import Hypothesis, at_full_weight
 from lce_rig.calibrate.likelihood.layout import Indices
-from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
+from lce_rig.calibrate.result import BY_ALGORITHM_1, CalibrationEstimate, Sensitivity
 from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
 from lce_rig.core.results import Observation
@@ -84,12 +84,12 @@ def find_causes(
 def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
     """Measure the change from the extrinsics in use, where these are significantly off.
 
-    Method "paper" estimates no constant errors, so its extrinsics may be farther off than the likelihood's.
+    Algorithm 1 estimates no constant errors, so its extrinsics may be farther off than the likelihood's.
     """
     if selected.gain.cause in MOUNTINGS:
         return selected
     apart = difference(selected.after.T_in_use, estimate.T_cam_lidar)
-    cov = estimate.cov + summed_covariance(estimate.sensitivities)
+    cov = estimate.cov + summed_covariance([e for e in estimate.sensitivities if e.source != BY_ALGORITHM_1])
     is_off = chance_of(float(apart @ np.linalg.solve(cov, apart)), 6) < _CHANCE
     return selected._replace(change=apart) if is_off else selected
 

@@ -8,19 +8,20 @@ that would resolve contradiction c. The reported covariance then covers the extr
 
 import math
 from collections.abc import Sequence
-from typing import get_args
 
 import numpy as np
 
-from lce_rig.calibrate.options import Source
-from lce_rig.calibrate.result import CalibrationEstimate, Sensitivity
+from lce_rig.calibrate.result import BY_ALGORITHM_1, CalibrationEstimate, Sensitivity
 from lce_rig.core.calibration import Contribution, Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.rig import CalibrationSettings
 
+OF_BOARD = ("square_size", "pattern_offset", "plate_size", "board_bow")
+"""Errors of the profile that sessions share; each fits its own lens."""
 # Part of the difference of two channels that counts: the result lies between both.
 _HALF = 0.5
 _CONTRADICTION = "contradiction_"
+_OTHER_ACTIONS = {BY_ALGORITHM_1: "other_method"}
 
 
 def summed_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
@@ -68,4 +69,4 @@ def measure_action(source: str) -> str:
     """Return the action against a source of uncertainty; "" if more captures reduce it."""
     if source.startswith(_CONTRADICTION):
         return "resolve"
-    return f"measure_{source}" if source in get_args(Source) else ""
+    return f"measure_{source}" if source in ("intrinsics", *OF_BOARD) else _OTHER_ACTIONS.get(source, "")

@@ -64,6 +64,7 @@ _MEASURE = {
     "measure_pattern_offset": "measure the pattern's margins: pattern_offset_m, pattern_offset_sigma_m",
     "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
     "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
+    "other_method": "calibrate without `--method paper`",
 }
 _CAUSES = {
     "captures": "the scatter of the captures",
@@ -73,6 +74,7 @@ _CAUSES = {
     "pattern_offset": "the pattern's place on the plate",
     "plate_size": "the plate's size",
     "board_bow": "the board's bow",
+    "algorithm_1": "Algorithm 1, which differs from the likelihood's estimate",
 }
 _CONTRADICTIONS = {
     "channels": "the camera's channels",

@@ -12,6 +12,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 from lce_rig.judge.causes import cause_findings, contradiction_of, find_causes, hypothesis_of, is_explained
 from lce_rig.judge.contributions import (
+    OF_BOARD,
     channels_contradict,
     list_contributions,
     summed_covariance,
@@ -82,8 +83,7 @@ def validate(
     return Validation(
         cov=cov_agreed + summed_covariance(contradictions),
         cov_agreed=cov_agreed,
-        # Each session fits its own lens.
-        cov_shared=summed_covariance([each for each in known if each.source != "intrinsics"]),
+        cov_shared=summed_covariance([each for each in known if each.source in OF_BOARD]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
         causes=causes,
         is_explained=is_explained(selected),

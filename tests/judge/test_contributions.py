@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import fit_extrinsic
 from lce_rig.core.geometry import difference, sigma_sizes
-from lce_rig.judge.contributions import summed_covariance
+from lce_rig.judge.contributions import OF_BOARD, summed_covariance
 from lce_rig.judge.validate import validate
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, simulate
@@ -40,7 +40,7 @@ def test_sound_covariance_is_the_sum(sound):
     assert not any(source.startswith("contradiction") for source in sources(examination))
     of_profile = summed_covariance(estimate.sensitivities)
     np.testing.assert_allclose(examination.cov, estimate.cov + of_profile)
-    of_board = [each for each in estimate.sensitivities if each.source != "intrinsics"]
+    of_board = [each for each in estimate.sensitivities if each.source in OF_BOARD]
     np.testing.assert_array_equal(examination.cov_shared, summed_covariance(of_board))
 
 

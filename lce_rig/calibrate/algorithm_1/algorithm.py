@@ -57,12 +57,10 @@ class Algorithm1(Start):
     """Algorithm 1's solution.
 
     Attributes:
-        fitted: the observations as used in the cost: ring ends are moved by the background's shift.
         problem: the moments of the captures used.
         cost: about the solution, in tangent (translation m, rotation rad) and edge shift m.
     """
 
-    fitted: Sequence[Observation]
     problem: Problem
     cost: Quadratics
 
@@ -79,16 +77,14 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
     """
     features = [extract_features(observation, board) for observation in observations]
     problem, T_planes = solve_planes(features, (NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
-    fitted = list(observations)
     shifts_m = estimate_shifts(observations, features, T_planes)
     if shifts_m.any():
-        fitted = move_ends(observations, features, T_planes, shifts_m)
-        features = [extract_features(observation, board) for observation in fitted]
+        moved = move_ends(observations, features, T_planes, shifts_m)
+        features = [extract_features(observation, board) for observation in moved]
         problem = Problem(features, problem.weights)
 
     refused, plane_m, edge_m = reject_outliers(features, problem, T_planes)
     observations = [o for o in observations if o.capture not in refused]
-    fitted = [o for o in fitted if o.capture not in refused]
     features = [f for f in features if f.capture not in refused]
     sigmas = max(float(np.median(plane_m)), _SIGMA_FLOOR_M), max(float(np.median(edge_m)), _SIGMA_FLOOR_M)
     problem, T_planes = solve_planes(features, sigmas, drop_uncertain(features, T_planes))
@@ -111,9 +107,8 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
         refused=refused,
         held_out_m=plane_m + edge_m,
         diagnostics=figures,
-        fitted=fitted,
         problem=problem,
-        cost=problem.quadratics(solution.x[0], solution.edge_ids[0], group_placements(fitted)),
+        cost=problem.quadratics(solution.x[0], solution.edge_ids[0], group_placements(observations)),
     )
 
 
