@@ -200,7 +200,11 @@ def _misfit(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _score(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
-    """Sum over captures 1 - r^2 of their best pair where r < 1: scores (H,), and r^2 (H, P)."""
+    """Score hypotheses (H,) by the sum of max(0, 1 - r^2) of each capture's best pair.
+
+    Returns:
+        The scores (H,) and the squared normalised misfits r^2 of all pairs (H, P).
+    """
     angle, distance = _misfit(pairs, R, t)
     r2 = (angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2
     first = np.flatnonzero(np.r_[True, np.diff(pairs.capture) > 0])

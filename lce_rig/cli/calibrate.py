@@ -302,11 +302,11 @@ def collect_command(session: lce.Session) -> str:
 
 
 def _take_profile(path: Path, profile: str) -> None:
-    """Give a session another profile of its rig, and say where the earlier one is.
+    """Replace a session's profile and print where the earlier one is kept.
 
     Raises:
-        ProfileError: it is not a valid profile.
-        SessionError: it is of another rig.
+        ProfileError: the new profile is not valid.
+        SessionError: the new profile describes another rig.
     """
     rig = lce.load_rig(profile)
     with lce.Session.open(path, writable=True) as session:

@@ -28,14 +28,14 @@ from lce_rig.pipeline.result_files import result_folder, with_profile_of
     "Read targets from this file [default: deploy.yaml beside SESSION].",
 )
 @result_option("Deploy")
-@click.option("--robot", metavar="NAME", help="Name the robot, for a target that stands for many.")
+@click.option("--robot", metavar="NAME", help="Name the robot, for a target shared by several robots.")
 @click.option("--dry-run", is_flag=True, help="Print the changes; change nothing.")
 @click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print the releases at the target; change nothing.")
-@click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
+@click.option("--rollback", is_flag=True, help="Restore the files of the previous release.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
 @click.option("--force", is_flag=True, help="Deploy against objections; requires --reason.")
-@click.option("--reason", default="", metavar="TEXT", help="Say why; it is written down at the target.")
+@click.option("--reason", default="", metavar="TEXT", help="State the reason; it is logged at the target.")
 @json_option
 def deploy(
     session: Path,

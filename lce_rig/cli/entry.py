@@ -8,9 +8,9 @@ from pathlib import Path
 
 from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_more, watch_for_interrupts
 
-# Share of the computer's memory and swap that a process may take: more makes it swap, and other programs end.
+# Limit as a share of the computer's memory and swap: above it the computer thrashes and kills programs.
 _SHARE_OF_MEMORY = 0.8
-# Least limit, bytes: sound sessions need 0.7 GB at most.
+# Lower bound of the limit, bytes: intact sessions need at most 0.7 GB.
 _LEAST_BYTES = 1 << 30
 
 

@@ -91,7 +91,7 @@ def check_profile(file: str) -> None:
     "--intrinsics",
     multiple=True,
     metavar="FILE|NUMBERS",
-    help="Of each camera in turn: a file (camera_info of ROS, ost.txt, Kalibr's camchain, OpenCV's "
+    help="Intrinsics of each camera, in order: a file (ROS camera_info, ost.txt, Kalibr's camchain, OpenCV's "
     "FileStorage, FAST-LIVO2's camera), or MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,...",
 )
 @click.option(

@@ -20,7 +20,7 @@ from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
-# Interval between searches of a whole image without a board, and of a scan after a candidate is lost, s.
+# Interval between full searches, s: of images without a board, and of scans whose candidate was lost.
 _SEARCH_S = 0.3
 # Factor on the tolerance of the nominal extrinsics within which a candidate counts as the camera's board.
 _NOMINAL_MARGIN = 1.5

@@ -103,7 +103,7 @@ class DavisSource(LiveSource):
         }
         for name, channel in self._settings.channels.items():
             if not self._has[channel.kind]:
-                what = f"{self._who}: {self._opened.device} has no {channel.kind} for channel {name!r}"
+                what = f"{self._label}: {self._opened.device} has no {channel.kind} for channel {name!r}"
                 raise SourceError(what, "Is it another model? Check driver.device, or delete the channel.")
 
     def close(self) -> None:
@@ -152,7 +152,7 @@ class DavisSource(LiveSource):
             is_running = getattr(self._input, "isRunningAny", self._input.isRunning)
             if not is_running():
                 hint = "Was it unplugged? Check cable and power; then start again."
-                raise SourceError(f"{self._who}: {self._opened.device} is gone", hint)
+                raise SourceError(f"{self._label}: {self._opened.device} is gone", hint)
             time.sleep(_PAUSE_S)
         return samples
 
@@ -182,7 +182,7 @@ class DavisSource(LiveSource):
 
     def _wrong_size(self, what: str) -> SourceError:
         width, height = self._settings.resolution_px
-        return SourceError(f"{self._who} sends {what}; the profile's has {width}x{height} px", _OTHER_MODEL)
+        return SourceError(f"{self._label} sends {what}; the profile's has {width}x{height} px", _OTHER_MODEL)
 
 
 def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:

@@ -117,7 +117,7 @@ def _number(field: bytes) -> int:
 
 
 def read_line(line: bytes) -> Message | None:
-    """Parse one line, without its end; None for text or another sentence.
+    """Parse one line without its line terminator; None for plain text and sentences of other types.
 
     Raises:
         ValueError: the line is damaged.

@@ -62,7 +62,7 @@ class ImagePipeSource(LiveSource):
         wanted = self._settings.driver.pixel_format or _USUAL_FORMAT
         code = find_format(wanted)
         if code is None or FORMATS[code].is_compressed:
-            what = f"{self._who}: raw images of driver.pixel_format {wanted!r} are not read"
+            what = f"{self._label}: raw images of driver.pixel_format {wanted!r} are not read"
             raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
             raise SourceError(what, f"It can be {raw}, or missing for {_USUAL_FORMAT}.")
         self._decoder, self._rest = PixelDecoder(code, *self._settings.resolution_px), bytearray()
@@ -77,7 +77,7 @@ class ImagePipeSource(LiveSource):
             )
         except OSError as error:
             hint = "Is the program installed? Give its full path."
-            what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
+            what = f"{self._label}: {command[0]} cannot be started: {error.strerror}"
             raise SourceError(what, hint) from None
         self._stack.callback(_end_process, self._process)
         self._selector = self._stack.enter_context(selectors.DefaultSelector())
@@ -141,7 +141,7 @@ class ImagePipeSource(LiveSource):
         hint = f"Run it in a shell: {' '.join(self._settings.driver.command)}"
         if lines:
             hint = f"It said: {' | '.join(line.strip() for line in lines)}"
-        raise SourceError(f"{self._who}: its command {how} after {self._n_images} images", hint)
+        raise SourceError(f"{self._label}: its command {how} after {self._n_images} images", hint)
 
 
 def _end_process(process: "subprocess.Popen[bytes]") -> None:

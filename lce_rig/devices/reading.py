@@ -162,22 +162,22 @@ class LiveSource(ABC):
     """
 
     def __init__(
-        self, sensor: str, who: str, silence_s: float, what_to_check: str = "", n_slots: int = _N_SLOTS
+        self, sensor: str, label: str, silence_s: float, silence_hint: str = "", n_slots: int = _N_SLOTS
     ) -> None:
         """Prepare without opening the device.
 
         Args:
             sensor: its name in the profile.
-            who: name of the sensor for messages: "camera 'cam'".
-            silence_s: time without a sample that is an error.
-            what_to_check: the hint of that error.
-            n_slots: most samples that may wait; beyond, the oldest is dropped.
+            label: name of the sensor in messages: "camera 'cam'".
+            silence_s: longest time without a sample, s; then the sensor counts as lost.
+            silence_hint: hint of the error for a lost sensor.
+            n_slots: capacity of the queue; when it is full, the oldest sample is dropped.
         """
         self.sensor = sensor
         self.lost: tuple[SourceError, float] | None = None
         self.opened_s: float | None = None
-        self._who = who
-        self._n_slots, self._silence_s, self._what_to_check = n_slots, silence_s, what_to_check
+        self._label = label
+        self._n_slots, self._silence_s, self._silence_hint = n_slots, silence_s, silence_hint
         self._inbox = Inbox[LiveSample]()
         self._stopping = threading.Event()
         self._settled = threading.Event()
@@ -211,7 +211,7 @@ class LiveSource(ABC):
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Explain a silence of `silence_s` since the device was opened or last sent."""
         what = "fell silent" if has_sent else "sends nothing"
-        return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
+        return SourceError(f"{self._label} {what}: nothing for {self._silence_s:g} s", self._silence_hint)
 
     def start(self, inbox: Inbox[LiveSample], reopen_every_s: float | None) -> None:
         """Open the device and read it into a queue, in a thread.
@@ -271,7 +271,7 @@ class LiveSource(ABC):
                 failure = error
             except Exception as error:  # A bug must not look like the end of the stream.
                 failure = SourceError(
-                    f"{self._who}: its reader failed: {error!r}", "This is a bug: report it."
+                    f"{self._label}: its reader failed: {error!r}", "This is a bug: report it."
                 )
                 failure.__cause__ = error
             self.close()

@@ -35,14 +35,14 @@ class Ros2Source(LiveSource):
     def __init__(self, sensor: str, settings: CameraSettings | LidarSettings) -> None:
         if isinstance(settings, CameraSettings):
             channel = settings.first_channel("frames") or next(iter(settings.channels))
-            named, who = settings.channels[channel].topic, f"camera {sensor!r}"
+            named, label = settings.channels[channel].topic, f"camera {sensor!r}"
             self._target = Target(sensor, channel)
         else:
-            named, who = settings.topic, f"LiDAR {sensor!r}"
+            named, label = settings.topic, f"LiDAR {sensor!r}"
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
         hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
-        super().__init__(sensor, who, _SILENCE_S, hint)
+        super().__init__(sensor, label, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
         self._waiting: list[tuple[int, bytes]] = []
@@ -59,11 +59,11 @@ class Ros2Source(LiveSource):
         if not self._topic:
             block = "cameras" if self._target.channel is not None else "lidars"
             hint = f"Set topic in {block}.{self.sensor}; `ros2 topic list -t` lists what is published."
-            raise SourceError(f"{self._who}: the profile names no topic", hint)
+            raise SourceError(f"{self._label}: the profile names no topic", hint)
         try:
             import rclpy
         except ImportError:
-            what = f"{self._who}: driver.type ros2 needs rclpy, which cannot be imported"
+            what = f"{self._label}: driver.type ros2 needs rclpy, which cannot be imported"
             hint = (
                 "Source ROS 2 first (source /opt/ros/humble/setup.bash) and use its Python; pip has no rclpy."
             )
@@ -145,6 +145,6 @@ class Ros2Source(LiveSource):
         if self._topic in types:
             wanted = " or ".join(sorted(self._target.types))
             raise SourceError(
-                f"{self._who}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
+                f"{self._label}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
             )
-        raise SourceError(f"{self._who}: nothing publishes {self._topic}", hint)
+        raise SourceError(f"{self._label}: nothing publishes {self._topic}", hint)

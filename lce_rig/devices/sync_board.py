@@ -85,17 +85,17 @@ class SyncBoard(LiveSource):
                 device, baud = self._settings.device, self._settings.port_baud
                 if not self._heard:
                     raise SourceError(
-                        f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
+                        f"{self._label} on {device} is silent: nothing for {self._hello_s:g} s",
                         "Check its power and firmware, and that sync.device is its port.",
                     )
                 raise SourceError(
-                    f"{self._who} on {device} does not talk LCE1: {self._heard!r}",
+                    f"{self._label} on {device} does not talk LCE1: {self._heard!r}",
                     f"Check sync.baud (now {baud}), that this is the board's port, and its firmware.",
                 )
         hello = self._state.hello
         if hello is not None and hello.version != lce1.VERSION:
             raise SourceError(
-                f"{self._who} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
+                f"{self._label} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
                 "Flash the firmware of this version of lce-rig.",
             )
 
@@ -123,7 +123,7 @@ class SyncBoard(LiveSource):
             pulses = self._state.feed(data, arrival)
             if self._is_set_up and arrival.steady_ns - self._state.heard_ns > SILENCE_S * NS_PER_S:
                 raise SourceError(
-                    f"{self._who} fell silent: nothing for {SILENCE_S:g} s",
+                    f"{self._label} fell silent: nothing for {SILENCE_S:g} s",
                     "Check its cable and power, and press its reset.",
                 )
             has_restarted = self._state.n_restarts != self._n_restarts
@@ -187,7 +187,7 @@ class SyncBoard(LiveSource):
             number = getattr(error, "errno", None)
             cause = errno.errorcode.get(number, number) if number else str(error).partition("(")[0].strip()
             raise SourceError(
-                f"{self._who} on {self._settings.device} is gone: {cause}",
+                f"{self._label} on {self._settings.device} is gone: {cause}",
                 "Check its plug and cable and its power; what was captured before is safe. Begin again when "
                 "`ls -l /dev/serial/by-id` shows it.",
             ) from None
@@ -195,7 +195,7 @@ class SyncBoard(LiveSource):
     def _explain(self, error: Exception) -> SourceError:
         """Explain why the port cannot be opened, with an action."""
         number, device = getattr(error, "errno", None), self._settings.device
-        what = f"{self._who}: {device}"
+        what = f"{self._label}: {device}"
         if number == errno.ENOENT:
             ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
             listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"

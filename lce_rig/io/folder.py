@@ -177,7 +177,7 @@ def _list(
         return here
     if len(holding) == 1:
         return next(iter(holding.values()))
-    hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
+    hint = f"Put them into its subfolder {names[0]}/; formats: {', '.join(sorted(suffixes))}."
     if names is CLOUD_FOLDERS:
         hint += " Or give the LiDAR's recording of the same time as well: --from lidar.pcap."
     if holding:
@@ -226,7 +226,7 @@ class FileOnDisk:
 
 @dataclass(frozen=True)
 class PlacementOnDisk:
-    """Images, then point clouds, of one placement of the board that have not been read yet."""
+    """Files of one placement of the board, not read yet: the images, then the point clouds."""
 
     files: tuple[FileOnDisk, ...]
 

@@ -79,12 +79,18 @@ def covariance_alone(calibration: Calibration) -> Array:
     return np.asarray(M @ with_lens(c.cov, c.intrinsics_cross_cov, c.intrinsics_cov) @ M.T)
 
 
-def as_used(calibration: Calibration, lens: Intrinsics) -> Array:
-    """Give the extrinsics (4, 4) that draw points with another lens as a result's own do with its intrinsics.
+def equivalent_extrinsics(calibration: Calibration, lens: Intrinsics) -> Array:
+    """Convert a result's extrinsics for use with other intrinsics.
+
+    With `lens`, the returned extrinsics project points to the same pixels as the result's extrinsics and
+    intrinsics do, up to the difference that no rotation absorbs.
 
     Args:
-        calibration: with its intrinsics; without, its extrinsics are returned unchanged.
-        lens: of the same camera model.
+        calibration: the result; without fitted intrinsics its extrinsics are returned unchanged.
+        lens: intrinsics of the same camera model.
+
+    Returns:
+        T_cam_lidar (4, 4).
     """
     fitted, model = calibration.intrinsics, model_of(lens)
     if fitted is None:

@@ -18,7 +18,7 @@ from lce_rig.core.geometry import (
     tangent_sizes,
 )
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE
-from lce_rig.judge.reach import JointDifference, as_used, covariance_alone
+from lce_rig.judge.reach import JointDifference, covariance_alone, equivalent_extrinsics
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
@@ -146,7 +146,9 @@ def compare_calibrations(
     lens, models = lenses[0], {each and (each.model, len(each.distortion)) for each in lenses}
     if lens is not None and len(models) == 1:
         # A session's extrinsics compensate the rotation of its own lens.
-        calibrations = {name: replace(c, T_cam_lidar=as_used(c, lens)) for name, c in calibrations.items()}
+        calibrations = {
+            name: replace(c, T_cam_lidar=equivalent_extrinsics(c, lens)) for name, c in calibrations.items()
+        }
         cov = np.array([calibrations[name].cov for name in names])
     else:
         cov = np.array([covariance_alone(calibrations[name]) for name in names])

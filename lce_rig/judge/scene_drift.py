@@ -57,7 +57,7 @@ class SceneChange(JointDifference):
         }
 
     def _sigma(self, part: slice) -> float:
-        """Return the standard deviation along the direction of a part, (3,), of the change."""
+        """Return the standard deviation of the rotation or translation (`part`) along its direction."""
         direction = self.significant[part] / max(float(np.linalg.norm(self.significant[part])), 1e-12)
         return float(np.sqrt(direction @ self.cov[part, part] @ direction))
 

@@ -157,7 +157,7 @@ def _variances(setup: Setup, state: LensState) -> Array:
 
 
 def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
-    """Return for each board the median of its channel (K,)."""
+    """Return the median variance (K,) of all boards on the channel of each board."""
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 

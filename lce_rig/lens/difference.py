@@ -99,19 +99,19 @@ def compare_lenses(
 
 
 def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> Array:
-    """Propagate the covariance of intrinsics to the errors that a profile states.
+    """Convert the covariance of intrinsics to the four errors that a profile states.
 
-    Parameters are correlated: the errors are fitted to the pixel displacements at places with boards.
+    As the parameters are correlated, the four errors are fitted to the pixel displacements at the corners.
 
     Args:
         fitted: the intrinsics.
-        corners_px: (n, 2) where boards were seen.
-        cov: (P, P) of their parameters.
-        model: whose parameters these are.
+        corners_px: (n, 2) detected board corners.
+        cov: (P, P) covariance of the parameters of the intrinsics.
+        model: the lens model with these parameters.
 
     Returns:
-        (4, 4) of the relative error of both focal lengths, of the principal point's x and y, px, and of the
-        pixels by which the distortion's cubic term displaces the image's corner outwards.
+        Covariance (4, 4) of the relative error of the focal length, of the principal point's x and y, px, and
+        of the outward displacement of the image's corner by the cubic distortion term, px.
     """
     vector, rays = model.vector(fitted), fitted.unproject(corners_px)
     _, _, by_lens = model.project(vector, rays[np.isfinite(rays).all(axis=1)])

@@ -148,16 +148,18 @@ class Setup:
 
 
 def board_shapes(board: Board) -> tuple[Array, Array]:
-    """List smooth deviations of a board from its nominal shape.
+    """Return the 15 basis functions of a board's deviation from its nominal shape.
 
-    Bends are heights of the plate towards the viewer, with zero mean and slope over the plate, so that the
-    board's frame stays in its middle: with u and v from -1 to 1 along width and height of the plate, 1/3 -
-    u^2 and 1/3 - v^2 (a bow by the height of the middle over the ends), u v (twist), and four of third order.
-    The pattern's aspect is the fraction by which it is longer along its width than along its height; second
-    order displaces it in x and y, and shears it.
+    With u and v from -1 to 1 along the plate's width and height, there are
+
+    - 7 bends, heights towards the viewer: two bows 1/3 - u^2 and 1/3 - v^2 (unit: height of the middle over
+      the ends), the twist u v, and four of third order. Mean and slope over the plate are zero, so that the
+      board's frame stays in its middle;
+    - the pattern's aspect: the fraction by which its width is stretched relative to its height;
+    - 6 displacements of the pattern in x and in y, of second order, and its shear.
 
     Returns:
-        (15, N, 3) displacement of the corners per unit, and (15,) standard deviations a priori.
+        (15, N, 3) displacement of the corners per unit, and (15,) prior standard deviations.
     """
     corners = board.corners()
     u, v = 2 * corners[:, 0] / board.width_m, 2 * corners[:, 1] / board.height_m

@@ -299,21 +299,21 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 def save_profile(
     session: Session, measured: Sequence[MeasuredIntrinsics], path: Path, *, is_forced: bool = False
 ) -> tuple[str, ...]:
-    """Write the session's profile with the intrinsics that the session determines better, and its comments.
+    """Write a copy of the session's profile with the improved intrinsics; comments are kept.
 
     Args:
-        session: whose profile.
-        measured: intrinsics from its boards.
-        path: of the new profile.
-        is_forced: write all of them.
+        session: the session with the original profile.
+        measured: intrinsics estimated from its boards.
+        path: the file to write.
+        is_forced: whether to write all intrinsics, not only the significantly better ones.
 
     Returns:
         The cameras whose intrinsics were replaced.
 
     Raises:
         UsageError: the file exists already.
-        ResultRefusedError: the session determines none better than its profile; nothing is written.
-        ProfileError: the intrinsics make no valid profile.
+        ResultRefusedError: no intrinsics are better than the profile's; nothing is written.
+        ProfileError: the profile with these intrinsics is not valid.
     """
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]

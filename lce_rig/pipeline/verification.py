@@ -164,7 +164,7 @@ def verify(
                 check = check_session(session.rig, detections, c, channel, scene)
                 # A result of this session has been judged by these boards.
                 if not c.captures_used and not c.is_of_peers:
-                    # The six axes together: residuals hide a rotation that a translation undoes.
+                    # Test all six axes jointly: a translation can compensate a rotation in the residuals.
                     key = (pair.camera, pair.channel)
                     alone = Detections(
                         {key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]}

@@ -161,18 +161,18 @@ class Mount(Settings):
 
 
 class NominalExtrinsic(Settings):
-    """The expected pose of a camera; compared with the result, an initial guess of `calibrate --scene` alone.
+    """The expected extrinsics of a camera, compared with the result.
 
-    It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
-    is given in exactly one way.
+    Only `calibrate --scene` uses them as the initial guess. They transform points from the LiDAR's frame to
+    the camera's optical frame: p_cam = R p_lidar + t. Exactly one form of the rotation must be given.
 
     Attributes:
         quaternion_wxyz: unit quaternion of R, scalar first.
         rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
         matrix: the rows of R.
         translation_m: t, the LiDAR's origin in the optical frame.
-        source: "cad", this rig's CAD model, with which the result must agree; or "typical", how such rigs are
-            built: for guidance and simulation, and no test of a result.
+        source: "cad" for this rig's CAD model, with which the result must agree; "typical" for a common
+            mounting of such rigs, used for guidance and simulation but not to judge results.
         tolerance_deg: larger differences from the result are reported.
         tolerance_m: larger differences from the result are reported.
     """

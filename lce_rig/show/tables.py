@@ -117,7 +117,7 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
     rows: list[Row] = []
     for variance, direction in zip(variances[::-1], directions.T[::-1], strict=True):
         sigma = math.sqrt(max(variance, 0.0))
-        # Eigenvectors have no sign of their own.
+        # The sign of an eigenvector is arbitrary: make its largest component positive.
         direction = direction * np.sign(direction[np.abs(direction).argmax()])
         size = f"{math.degrees(sigma):.3f} deg" if unit == "deg" else f"{1000 * sigma:.1f} mm"
         rows.append((kind, "(" + ", ".join(f"{value + 0.0:+.2f}" for value in direction) + ")", size))

@@ -1,4 +1,4 @@
-"""The board about a pose: that of the scan before, or one that an image predicts."""
+"""Search for the board near a pose: from the previous scan, or predicted from an image."""
 
 import numpy as np
 import pytest

@@ -93,7 +93,7 @@ def test_garbage_between_lines_is_survived_counted_and_told():
     assert damaged.figure("n") >= 19
 
 
-def test_pulses_whose_lines_are_lost_are_counted_and_told():
+def test_lost_pulse_lines_are_counted_and_reported():
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         pulses = take(samples, 10)
         fake.n_to_lose = 4
@@ -108,7 +108,7 @@ def test_pulses_whose_lines_are_lost_are_counted_and_told():
 
 
 @pytest.mark.parametrize("says_hello", [True, False])
-def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
+def test_restarted_board_is_reconfigured_and_reported(says_hello):
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         take(samples, 20)
         fake.reset(says_hello)

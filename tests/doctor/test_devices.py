@@ -13,7 +13,7 @@ from lce_rig.rig import load_rig
 from .observed import S, camera, codes, examination, lidar, look, make_rig
 
 
-def test_what_does_not_open_is_red_with_what_to_check():
+def test_sensor_that_does_not_open_is_an_error_with_hint():
     seen = ObservedSensor(
         "cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it.")
     )

@@ -112,7 +112,7 @@ def test_deploy_unfit_result_needs_a_reason(result, rig, local, robot, changes, 
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
 
-def test_deploy_names_robot_or_takes_unknown(result, rig, local):
+def test_deploy_refuses_result_of_other_or_unnamed_robot(result, rig, local):
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
     unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))

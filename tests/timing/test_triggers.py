@@ -1,4 +1,4 @@
-"""Pictures and the pulses that made them: matched by number, whatever is lost, repeated or late."""
+"""Match images to trigger pulses by number, with lost, repeated and late ones."""
 
 from dataclasses import dataclass, field
 

@@ -47,17 +47,17 @@ class Levels:
         return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
 
     def ratio(self, name: str) -> float:
-        """Return a level in units of the usual one."""
+        """Return a level relative to its default."""
         return float(getattr(self, name) / getattr(Levels(), name))
 
     @property
     def largest_of_images(self) -> float:
-        """The largest `ratio` of the images' levels."""
+        """Largest `ratio` of the images' levels."""
         return max(self.ratio(name) for name in OF_IMAGES)
 
     @property
     def with_usual_images(self) -> "Levels":
-        """Set the images' levels to the usual ones."""
+        """Reset the images' levels to their defaults."""
         return replace(self, **{name: getattr(Levels(), name) for name in OF_IMAGES})
 
 

@@ -196,12 +196,12 @@ class Predictor:
         return Evidence(hessians, rings.n_rings, rings.n_points.sum(axis=1))
 
     def combine(self, held: Evidence, more: Evidence | None = None, weight: float = 1.0) -> Precision:
-        """Predict (6, 6) from all placements together, equation (1).
+        """Predict the covariance of the extrinsics (6, 6) from all placements together, equation (1).
 
         Args:
-            held: the placements.
-            more: N further placements: each in turn beside those held gives (N, 6, 6).
-            weight: number of captures of each placement held.
+            held: the placements captured so far.
+            more: N candidate placements, each added alone to `held`; the result is (N, 6, 6).
+            weight: number of captures per placement in `held`.
         """
         data = weight * held.hessians.sum(axis=0)
         if more is None:
@@ -272,7 +272,7 @@ class Predictor:
 
 
 def _straight_ahead(model: SensorModel) -> Array:
-    """Place a board 2 m before the LiDAR's middle laser, facing it: T_lidar_board (4, 4)."""
+    """Return T_lidar_board (4, 4) of a board that faces the LiDAR 2 m ahead, at its median elevation."""
     angle = float(np.median(model.elevations_rad))
     normal = np.array([-np.cos(angle), 0.0, -np.sin(angle)])
     right = np.array([0.0, -1.0, 0.0])
@@ -291,10 +291,10 @@ def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
 def few_captures_factor(n_captures: int) -> float:
     """Return the small-sample inflation factor of the covariance.
 
-    It is the correction of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
-    `_N_UNKNOWNS` + 2 captures; below one more it grows with the inverse of their number. Few captures show
-    neither their noise nor outliers: results of 6 to 8 captures of a recording (rlfs02) were .2 deg from that
-    of all 27, two to three of their standard deviations; of 10 captures .1 deg.
+    It is the factor of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
+    `_N_UNKNOWNS` + 2 captures. With fewer than `_N_UNKNOWNS` + 3 it is extrapolated as 1/n. Few captures
+    reveal neither noise nor outliers: with 6 to 8 captures of rlfs02, results differed from that of all 27
+    by 0.2 deg, 2 to 3 standard deviations; with 10 captures by 0.1 deg.
     """
     fewest = _N_UNKNOWNS + 3
     if n_captures < fewest:

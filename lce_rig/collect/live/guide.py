@@ -352,10 +352,10 @@ _ELSEWHERE = "hold it somewhere else, tilted otherwise"
 
 @dataclass(frozen=True)
 class Narration:
-    """The message for one moment.
+    """The instruction shown to the person with the board.
 
     Attributes:
-        phase, headline, detail, hold_s: as `LiveState`.
+        phase, headline, detail, hold_s: see `LiveState`.
     """
 
     phase: Phase
@@ -403,7 +403,7 @@ def _next(guide: Guide, present: Array, otherwise: str) -> str:
     return say(instructions) if instructions else otherwise
 
 
-#: Longest time for which a live moment waits for a better one of its place.
+#: Longest wait for a better capture at the same placement, s.
 LIVE_PATIENCE_S = 0.7
 
 
@@ -411,7 +411,7 @@ class StillBoards:
     """Captures boards that stand still for `hold_s`.
 
     Attributes:
-        is_decided: whether the board was captured, or is not to be, before it has moved.
+        is_decided: whether the board has been captured or rejected since it last moved.
     """
 
     def __init__(self, rig: Rig, hold_s: float) -> None:

@@ -278,7 +278,7 @@ class Walker:
                 return
 
     def walk(self, now_s: float) -> None:
-        """Move the board to its place on the way at a time."""
+        """Move the board along its path to its position at `now_s`."""
         if self._way is None:
             return
         start, end, from_s, until_s = self._way

@@ -70,16 +70,18 @@ def _shortest_side_px(grid_px: Array) -> float:
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
-    """Check that the pattern ends at the border of the grid of corners.
+    """Check whether the grid of corners covers the whole pattern.
 
-    The squares outside the outermost corners must alternate as those inside do, the next ones must not.
+    One row of squares surrounds the outermost corners. It must alternate like the inner squares, and the
+    next row outwards must not.
 
     Args:
-        grid_px: (rows, cols, 2).
+        grey: (H, W) the image.
+        grid_px: (rows, cols, 2) the corners.
 
     Returns:
-        Contrast of the weakest side of outer squares over that of the inner squares, 1 on a clean board, and
-        whether the squares go on beyond them on some side, so that only a part of a larger board was taken.
+        Lowest contrast of the four surrounding rows, relative to the inner squares (1 on a clean board), and
+        whether the squares continue beyond any of them: then the grid is part of a larger board.
     """
     wide = _widened(_widened(grid_px))
     height, width = grey.shape
@@ -99,7 +101,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
 
 
 def is_whole(grey: NDArray[np.uint8], grid_px: Array) -> bool:
-    """Check that a grid of corners is a whole pattern, and so its number of corners that of a board."""
+    """Check that a grid of corners covers a whole pattern, so that its size identifies the board."""
     outer_contrast, goes_on = extent(grey, grid_px)
     return outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on
 

@@ -99,7 +99,7 @@ def _fit_patches(
         patches = Patches(np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0), REACH)
     e1, e2, clear = patches
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
-    # Width of a square across its edges: length of one unit of a and of b, px.
+    # Distance between opposite edges of a square, px: the length of one unit of a and of b.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
     n = int(np.clip(2 * round(REACH * longest_px) + 1, 7, most_samples))

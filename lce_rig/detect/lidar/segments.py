@@ -20,17 +20,17 @@ RANGE_NOISE_FLOOR_M = 0.004
 
 @dataclass(frozen=True, eq=False)
 class OrderedScan:
-    """The usable returns of a scan, ring after ring, each by rising azimuth from a gap or jump onwards.
+    """The usable returns of a scan, sorted by ring and then by azimuth.
 
-    No surface is cut in two by the seam at azimuth +-pi.
+    Each ring starts at a gap or range jump, so that the seam at azimuth +-pi cuts no surface in two.
 
     Attributes:
-        index: (N,) of each return in the scan it comes from.
+        index: (N,) index of each return in the original scan.
         points: (N, 3) m, frame lidar.
         range_m: (N,).
         azimuth: (N,) atan2(y, x), rad.
         ring: (N,).
-        is_break: (N,) whether the return before it in its ring lies on another surface or too far off.
+        is_break: (N,) whether the ring's previous return lies on another surface or too far away.
         step_rad: angle between neighbouring firings of one ring.
         sigma_m: noise of a single range.
     """

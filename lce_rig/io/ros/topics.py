@@ -200,12 +200,12 @@ class SensorTopic:
 
     @property
     def namespace(self) -> str:
-        """The topic without its last part, and without that of a transport such as compressed."""
+        """The topic's namespace: without its last part and any image transport suffix."""
         return _namespace(self.image_topic)
 
     @property
     def image_topic(self) -> str:
-        """The topic without the part of a transport, such as compressed."""
+        """The topic without an image transport suffix such as /compressed."""
         return self.topic.removesuffix("/compressed").removesuffix("/theora")
 
 

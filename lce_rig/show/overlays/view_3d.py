@@ -115,14 +115,14 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
 
 
 def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]) -> None:
-    """Write the window's first view as PNG or JPEG, by the name of the file.
+    """Render the capture in 3D to a PNG or JPEG file; the suffix selects the format.
 
     Raises:
-        SourceError: nothing can be rendered here, or the name does not end in a known suffix.
+        SourceError: rendering is not possible on this computer, or the suffix is not supported.
         SessionError: the file cannot be written.
     """
     if path.suffix.lower() not in _PICTURES:
-        raise SourceError(f"{path} is no name of a picture", "Name a PNG or JPEG file.")
+        raise SourceError(f"{path} is not an image file name", "Name a PNG or JPEG file.")
     o3d = _open3d()
     window = _opened(o3d.visualization.Visualizer(), is_visible=False)
     _fill(o3d, window, _cloud(o3d, capture), cameras)
@@ -133,7 +133,7 @@ def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]
         window.capture_screen_image(str(drawn), do_render=True)
         window.destroy_window()
         if not drawn.exists():
-            raise SourceError("Open3D has drawn no picture", _HINT)
+            raise SourceError("Open3D did not write an image", _HINT)
         write_atomically(path, drawn.read_bytes())
 
 

@@ -158,7 +158,7 @@ def _gallery(
 def _drawings(
     c: Calibration, board: Board, lens: Intrinsics | None, evidence: Evidence | None, anchor: str
 ) -> dict[str, Markup]:
-    """Draw a result; nothing without its boards."""
+    """Draw a result's figures by name; none without its boards or intrinsics."""
     if evidence is None or lens is None:
         return {}
     links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}

@@ -74,7 +74,7 @@ def _compare_with_picture(page, is_mirrored):
     wanted = np.array(page.evaluate(_ON_SCREEN % "wanted"))
     page.evaluate("document.querySelectorAll('#outlines, #legend').forEach((each) => each.style.opacity = 0)")
     screen = cv2.cvtColor(page.screenshot(), cv2.COLOR_BGR2GRAY)
-    # The bright square of the picture, as the browser painted it.
+    # The bright square of the image, as rendered by the browser.
     left, top = np.floor(found.min(axis=0)).astype(int) - 15
     right, bottom = np.ceil(found.max(axis=0)).astype(int) + 15
     rows, columns = np.nonzero(screen[top:bottom, left:right] > 130)
@@ -82,7 +82,7 @@ def _compare_with_picture(page, is_mirrored):
         [columns.min() + left, rows.min() + top, columns.max() + left + 1, rows.max() + top + 1]
     )
     assert np.abs(painted - np.concatenate([found.min(axis=0), found.max(axis=0)])).max() <= 1.5
-    # The whole picture fits, and both outlines share its scale.
+    # The whole image is visible, and both outlines have its scale.
     scale = np.ptp(found, axis=0) / np.ptp(PRESENT_PX, axis=0)
     assert np.allclose(scale, scale[0])
     assert np.allclose(np.ptp(wanted, axis=0), scale * np.ptp(WANTED_PX, axis=0))
