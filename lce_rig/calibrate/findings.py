@@ -1,4 +1,4 @@
-"""Findings of the calibration: captures that disagree, and captures that are too few."""
+"""Findings of the calibration: captures that disagree, and too few captures."""
 
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import captures_to_add, fill

@@ -14,7 +14,7 @@ from lce_rig.rig import BoardSettings, CameraSettings, LidarIntrinsicsSettings, 
 
 Source = Literal["intrinsics", "square_size", "pattern_offset", "plate_size", "board_bow"]
 
-# As a fraction of a square, where a profile states none: two millimetres in a metre.
+# Prior relative error of a square, if the profile states none: 2 mm per metre.
 _SQUARE = 2e-3
 
 
@@ -73,7 +73,7 @@ class CalibrateOptions:
 
 @dataclass(frozen=True, eq=False)
 class KnownLidar:
-    """Constant errors of a LiDAR, measured before.
+    """Constant errors of a LiDAR, measured earlier.
 
     Attributes:
         rings: (K,) ring numbers.
@@ -91,7 +91,7 @@ class KnownLidar:
 
     @classmethod
     def of(cls, settings: LidarIntrinsicsSettings | None) -> "KnownLidar | None":
-        """Read a profile's block; None if there is none."""
+        """Read a profile's block; None if it is missing."""
         if settings is None:
             return None
         lasers = settings.lasers
@@ -133,7 +133,7 @@ class EstimateSettings(CalibrateOptions):
     def of(
         cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None
     ) -> "EstimateSettings":
-        """Add the profile's settings of a LiDAR, and of lens and board, to a user's options."""
+        """Combine a user's options with the profile's settings of a LiDAR, lens and board."""
         return cls(
             options.method,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,

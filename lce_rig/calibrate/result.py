@@ -18,7 +18,7 @@ from lce_rig.core.results import ImageBoard, Observation
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Effect of an error of the profile on the extrinsics, used with the result's intrinsics.
+    """Effect of a profile error on the extrinsics when used with the result's intrinsics.
 
     Or the moves that would resolve a check's contradiction: the covariance holds both sides.
 
@@ -33,13 +33,13 @@ class Sensitivity:
     moves: Array
 
     def covariance(self) -> Array:
-        """Compute the covariance (6, 6) for the source's standard deviation."""
+        """Compute the covariance (6, 6) for the standard deviation of this source."""
         return np.asarray(self.sigma**2 * self.moves.T @ self.moves)
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A solution of the captures that agree, from which an estimate begins.
+    """Initial guess of an estimate: a solution of the captures that agree.
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
@@ -121,13 +121,13 @@ class CalibrationEstimate:
 
     @property
     def as_start(self) -> Start:
-        """The solution from which another estimate of the same captures begins."""
+        """Return the solution as initial guess for another estimate from the same captures."""
         held_out_m = np.array([residual.held_out_m for residual in self.residuals])
         seen = list(self.observations.values())
         return Start(self.T_cam_lidar, self.certificate, seen, self.refused, held_out_m, self.diagnostics)
 
     def captures_of(self, names: Iterable[str]) -> set[str]:
-        """Name every capture that holds the scan of one of the captures named."""
+        """Name every capture that contains the scan of one of the named captures."""
         return {capture for name in names for capture in self.same_scan.get(name, (name,))}
 
 
@@ -173,19 +173,19 @@ def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagn
 
 
 def lever_arm(observations: Sequence[Observation]) -> float:
-    """Compute the rms distance of the boards from the first sensor, m: displacement by a turn of 1 rad."""
+    """Compute the rms distance of the boards from the first sensor, m: displacement per rad of rotation."""
     centres = [observation.pose.T_cam_board[:3, 3] for observation in observations]
     return float(np.sqrt(np.mean([centre @ centre for centre in centres])))
 
 
 def squares_scale(diagnostics: Diagnostics) -> float:
-    """Compute the size of the board's squares by profile and LiDAR, relative to the profile's."""
+    """Compute the size of the board's squares from profile and LiDAR, relative to the profile's."""
     scale = diagnostics.camera_scale
     return 2.0 - scale if np.isfinite(scale) else 1.0
 
 
 def with_squares(observation: Observation, squares: float) -> Observation:
-    """Move the first sensor's board to the distance that squares of `squares` times the size mean."""
+    """Move the first sensor's board to the distance expected for squares of `squares` times the size."""
     T_cam_board = observation.pose.T_cam_board.copy()
     T_cam_board[:3, 3] *= squares
     return replace(observation, pose=replace(observation.pose, T_cam_board=T_cam_board))
@@ -228,7 +228,7 @@ def capture_residual(
 
 def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
     """Average per-capture residuals: MPE, MEE (mean distances) and the rms corner residual."""
-    # A scan may show the board without any usable end of a ring.
+    # A scan may show the board without any usable ring end.
     edges = np.array([r.edge_mean_m for r in residuals])
     return Metrics(
         mpe_m=_mean(np.array([r.plane_mean_m for r in residuals])),

@@ -1,4 +1,4 @@
-"""Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
+"""Uncertainty of a solution: covariance, its leave-one-out check, and errors of the profile."""
 
 import math
 from collections.abc import Mapping
@@ -35,14 +35,14 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
 from lce_rig.core.geometry import Array, invert, transform
 
-# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
+# Significance threshold of (ratio of covariances - 1), in its standard deviations.
 _SURE = 2.0
 
 
 def by_scatter(
     start: Algorithm1, joint: JointEstimate, board: Board, settings: EstimateSettings
 ) -> CalibrationEstimate:
-    """Report Algorithm 1's solution: covariance from the scatter of captures, and from the LiDAR's errors.
+    """Report Algorithm 1's solution, with the covariance from the captures' scatter and the LiDAR's errors.
 
     Args:
         start: the solution.
@@ -81,7 +81,7 @@ def by_scatter(
 
 
 def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array]:
-    """Differentiate the solution by constant errors of the scans and the plate, by one Newton step.
+    """Differentiate the solution by constant errors of scans and plate, with one Newton step.
 
     With half gradient g and half Hessian H of the cost, both at the solution, an error b moves the minimum by
 
@@ -121,19 +121,19 @@ def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array
         sideways = (outwards / (f.edge_points @ normal))[:, None]
         by_lift -= J_end.T @ (sideways * _one_x_y(T_board_lidar, f.edge_points))
         changes[: L + 2] += (by_lift @ lifted).T
-        # Of a wider plate, either edge lies half as much farther out.
+        # Each edge of a wider plate lies farther out by half the difference.
         changes[L + 2 :] += np.abs(board.edges()[1][edge, :2]).T @ J_end / 2
     moves = -changes @ symmetric_inverse(start.cost.information)
     return moves[:L], moves[L : L + 2], moves[L + 2 :]
 
 
 def _one_x_y(T_board_lidar: Array, points: Array) -> Array:
-    """List 1, x and y on the board of points (N, 3) of the LiDAR: (N, 3)."""
+    """Return the rows [1, x, y] of the LiDAR's points (N, 3) on the board: (N, 3)."""
     return np.column_stack([np.ones(len(points)), transform(T_board_lidar, points)[:, :2]])
 
 
 def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
-    """Compute how far moves of the boards' poses in the images (n, F, 6) move the solution: (n, 6).
+    """Propagate shifts of the boards' poses in the images (n, F, 6) to the solution: (n, 6).
 
     A board that moves by (d, phi) looks to the LiDAR as if the extrinsics moved by
     (-d - phi x (t - c), -phi), c the board's place.
@@ -152,7 +152,7 @@ def _sensitivities(
     lens: SessionLens | None,
     of_scans: Mapping[Source, Array],
 ) -> tuple[tuple[Sensitivity, ...], Array]:
-    """Collect the moves of Algorithm 1's solution by errors of lens and board.
+    """Collect the shifts of Algorithm 1's solution by errors of lens and board.
 
     Args:
         start: the solution.
@@ -180,7 +180,7 @@ def _sensitivities(
 def systematic_covariances(
     sensitivities: Array, sigma_each: float, sigma_common: float
 ) -> tuple[Array, Array]:
-    """Propagate errors common to all groups, which the scatter between groups cannot show.
+    """Propagate errors common to all groups, which the scatter between groups does not contain.
 
     Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
     moves the estimate by s_r for each unit. Independent deviations less their mean leave
@@ -271,7 +271,7 @@ def with_errors(
 def with_corrected_planes(
     estimate: CalibrationEstimate, board: Board, rings: NDArray[np.int16], state: State
 ) -> CalibrationEstimate:
-    """Add the mean plane error of the points without the LiDAR's estimated constant errors.
+    """Add the mean plane error of the points after correction of the LiDAR's estimated constant errors.
 
     Args:
         estimate: of a camera and a LiDAR.
@@ -296,7 +296,7 @@ def without_lidar(figures: Diagnostics) -> Diagnostics:
 
 
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
-    """Multiply a covariance (6, 6) where the spread (6, 6) over placements significantly exceeds it.
+    """Scale a covariance (6, 6) up where the scatter (6, 6) between placements significantly exceeds it.
 
     The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
     noise model. If it exceeds the model's covariance, there are errors that the model lacks.
@@ -305,7 +305,7 @@ def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
         The covariance and the factor, 1 if they agree.
     """
     ratio = float(np.trace(symmetric_inverse(cov) @ spread)) / len(cov)
-    # A mean of 6 chi squares over n - 1 freedoms each.
+    # Standard deviation of a mean of 6 chi-squared values with n - 1 degrees of freedom each.
     chance = np.sqrt(2 / (len(cov) * max(n_placements - 1, 1)))
     factor = ratio if ratio > 1 + _SURE * chance else 1.0
     return factor * cov, factor

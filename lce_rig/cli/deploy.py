@@ -1,4 +1,4 @@
-"""`lce-rig deploy`: put a result on a robot, show the deployed one, or go back."""
+"""`lce-rig deploy`: put a result on a robot, show the deployed one, or roll back."""
 
 import shlex
 from collections.abc import Callable
@@ -146,7 +146,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
 
 
 def _print_changes(plan: Plan, say: Callable[[str], None]) -> None:
-    """Print a line of each sensor: its movement, and its verdict where that changes."""
+    """Print each sensor's movement on a line, and its verdict if that changes."""
     for change in () if plan.is_in_place else plan.sensors:
         how = "new" if change.is_new else "removed"
         if change.rotation_deg is not None and change.translation_m is not None:

@@ -11,7 +11,7 @@ from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 
-#: Limit of the data waiting for the disk: beyond it, data are dropped.
+#: Limit of data waiting for the disk, bytes; above it, new data are dropped.
 MOST_WAITING_BYTES = 512 * 2**20
 
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""Raw images from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
+"""Raw images from a command's standard output: GStreamer, ffmpeg or any other program."""
 
 import os
 import selectors
@@ -16,9 +16,9 @@ from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.rig import CameraSettings
 
-# Longest silence before a camera is lost, s: commands may take seconds to open one.
+# Longest silence before a camera counts as lost, s: commands may take seconds to open one.
 _SILENCE_S = 10.0
-# Time for a command to end, s, before it is killed.
+# Grace period for a command to end, s, before it is killed.
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
 _TAIL_BYTES = 2000
@@ -27,7 +27,7 @@ _EXAMPLE = "ffmpeg -loglevel error -f v4l2 -i /dev/video0 -pix_fmt bgr24 -f rawv
 
 
 class ImagePipeSource(LiveSource):
-    """A camera read by a command of the profile; see `LiveSource`.
+    """A camera read by a command from the profile; see `LiveSource`.
 
     The command writes images of the profile's size and pixel_format, without anything between them.
     Such a stream carries no timestamps: those given are the arrival of an image's last byte, and the status
@@ -101,7 +101,7 @@ class ImagePipeSource(LiveSource):
         return self._process.stdout, self._process.stderr
 
     def read(self) -> list[LiveSample]:
-        """Return the images that came; see `LiveSource`."""
+        """Return the received images; see `LiveSource`."""
         pictures, complaints = self._pipes()
         samples: list[LiveSample] = []
         for key, _ in self._selector.select(READ_WAIT_S):
@@ -145,7 +145,7 @@ class ImagePipeSource(LiveSource):
 
 
 def _end_process(process: "subprocess.Popen[bytes]") -> None:
-    """Stop the command and all it has started, by force if need be."""
+    """Stop the command and its child processes, by force if necessary."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

@@ -65,7 +65,7 @@ FORMATS = {
 
 
 def find_format(name: str) -> str | None:
-    """Find the code of a pixel format; None if it is not read here."""
+    """Find the code of a pixel format; None if not supported."""
     code = name.strip().upper().ljust(4)
     return code if code in FORMATS else None
 

@@ -97,7 +97,7 @@ class Ros2Source(LiveSource):
         self._stack.close()
 
     def read(self) -> list[LiveSample]:
-        """Return the samples that came; see `LiveSource`."""
+        """Return the received samples; see `LiveSource`."""
         self._executor.spin_once(timeout_sec=READ_WAIT_S)
         came, self._waiting = self._waiting, []
         samples: list[LiveSample] = []
@@ -120,7 +120,7 @@ class Ros2Source(LiveSource):
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)
 
     def _find_type(self, node: Any) -> str:
-        """Wait until the topic is published, and name its type without ROS 2's "/msg".
+        """Wait until the topic is published, and return its type without ROS 2's "/msg".
 
         Raises:
             SourceError: it is not, or is of another type.

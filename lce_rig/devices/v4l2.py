@@ -1,4 +1,4 @@
-"""A camera of the kernel's video interface: images with the kernel's timestamps, counted, in UTC.
+"""A V4L2 camera: images with the kernel's timestamps and sequence numbers, in UTC.
 
 Drivers say CLOCK_MONOTONIC. Jetson's do too, and use a counter that is seconds away from it. So every clock
 is tried on the timestamps: an image is younger than 0.2 s when it arrives, and never of the future.
@@ -41,7 +41,7 @@ _SILENT_HINT = (
 
 
 Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
-# Jetson's drivers flag end of frame, but their timestamp is of the first row's arrival (devices' forums).
+# Jetson's drivers set the end-of-frame flag, but their timestamp is the first row's arrival (vendor forums).
 _JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
 _MAX_DELAY_NS = 200_000_000
 # Largest delay once a clock is known: images come late from the queue after a computer stalls.
@@ -61,7 +61,7 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 
 
 def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us: float | None) -> int:
-    """Return the time from a timestamp's moment to the middle of the image's exposure.
+    """Return the time from the timestamped moment to the middle of the image's exposure.
 
     A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
     to H-1, exposure e and line time l (0 for a global shutter), the middle row m = (H-1)/2 is half exposed at
@@ -89,7 +89,7 @@ def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us:
 
 
 def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
-    """Find which moment a timestamp marks: as the profile says, else as a buffer's flags do.
+    """Find the moment that a timestamp marks: from the profile, else from a buffer's flags.
 
     Args:
         settings: the camera's.
@@ -105,7 +105,7 @@ def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
 
 
 def read_clocks() -> dict[str, int]:
-    """Read every candidate clock now, ns; Jetson's counter only where the kernel gives its offset."""
+    """Read every candidate clock now, ns; Jetson's counter only if the kernel reports its offset."""
     readings = {name: time.clock_gettime_ns(number) for name, number in _CLOCK_IDS.items()}
     try:
         offset_ns = int(_TSC_OFFSET.read_text())
@@ -133,7 +133,7 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, 
 
 
 class StampClock:
-    """Converts a driver's timestamps to UTC, by the clock that they fit.
+    """Converts a driver's timestamps to UTC, using the clock that matches them.
 
     The computer's UTC clock may be stepped during a run, so its offset from the driver's clock is measured
     again for every image.
@@ -294,11 +294,11 @@ class V4l2Source(LiveSource):
         return PixelDecoder(code, width, height, stride)
 
     def read(self) -> list[LiveSample]:
-        """Return the image that came; see `LiveSource`."""
+        """Return the received image; see `LiveSource`."""
         try:
             came = self._device.read(READ_WAIT_S)
         except OSError:
-            # The kernel calls it temporary; should it last, the silence ends it.
+            # The kernel calls it temporary; if it persists, the silence timeout ends it.
             self._n_damaged += 1
             time.sleep(READ_WAIT_S)
             return []

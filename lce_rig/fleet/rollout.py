@@ -1,4 +1,4 @@
-"""Deploy the newest results of many robots to them, one after the other, until the first failure.
+"""Deploy the newest results of many robots, one robot after the other, until the first failure.
 
 Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.
@@ -28,7 +28,7 @@ _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
 @dataclass(frozen=True)
 class RobotState:
-    """One robot in a roll-out.
+    """One robot in a rollout.
 
     Attributes:
         robot: its name.
@@ -49,14 +49,14 @@ class RobotState:
     detail: str = ""
 
     def ended(self, state: State, cause: "Exception | str" = "") -> "RobotState":
-        """Return the robot after a step."""
+        """Return the robot's state after a step."""
         detail = f"{cause.what} {cause.hint}".strip() if isinstance(cause, LceRigError) else str(cause)
         return replace(self, state=state, detail=detail)
 
 
 @dataclass
 class Rollout:
-    """The outcome of a roll-out.
+    """The outcome of a rollout.
 
     Attributes:
         target: its name.

@@ -1,4 +1,4 @@
-"""The work on one session: detect, calibrate, draw, write, in a process of its own.
+"""Work on one session: detect, calibrate, draw, write, in a separate process.
 
 A session that hangs, crashes or takes too much memory ends alone, with its cause.
 """
@@ -47,14 +47,14 @@ from lce_rig.session.session import (
     RESULTS,
 )
 
-# Files and folders on which no result depends.
+# Files and folders that do not affect a result.
 _NOT_NEEDED = frozenset({CALIBRATION, RESULTS, INTRINSICS, DEBUG, REJECTED, OVERLAYS, LOCK})
 _HASH_DIGITS = 12
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a run, for all its sessions.
+    """Settings of a run, common to its sessions.
 
     Attributes:
         registry: its path or address.
@@ -81,7 +81,7 @@ def work_order(arguments: Mapping[str, Any], tell: Callable[[Row], None]) -> lis
 
 
 def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]:
-    """Run one session, unless the registry holds its result already.
+    """Run one session, unless the registry already holds its result.
 
     Args:
         job: the session.
@@ -122,7 +122,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
             kind = next(kind for each, kind in findings.OF_ERRORS.items() if isinstance(error, each))
             cause = error.finding if isinstance(error, NotEnoughDataError) else None
             failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
-            # Files are named by the session's place.
+            # Replace temporary paths by the session's path.
             failed["detail"] = failed["detail"].replace(str(scratch / "session"), job.source)
             return publish(registry, [failed], start_s)
 
@@ -141,7 +141,7 @@ def first_row(job: Job, settings: Settings) -> Row:
 
 
 def _open(job: Job, scratch: Path) -> tuple[Rig, Session | None, Provenance]:
-    """Copy a session or recording to a folder of this computer.
+    """Copy a session or recording to a local folder.
 
     Returns:
         The profile; the session, None for a recording; its origin, of a recording the robot that the profile
@@ -190,7 +190,7 @@ def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
-    """Describe a session, or one pair of its sensors, that has no result."""
+    """Describe a session, or one pair of its sensors, without a result."""
     return row | {"status": status, "cause": cause.code, "detail": cause.text}
 
 
@@ -204,7 +204,7 @@ def _calibrate(
     solved = {(c.camera, c.lidar) for c in result.pairs}
     every = [*detections.pairs, *detections.peers(session.rig.lidars)]
     pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in every)
-    # Shortages stand in the order of the pairs they belong to.
+    # Report shortages in the order of their pairs.
     lacking = [
         without_result(row | {"camera": camera, "lidar": lidar}, "failed", why)
         for (camera, lidar), why in zip([p for p in pairs if p not in solved], result.shortages, strict=False)
@@ -266,7 +266,7 @@ _WITHOUT_MEMORY = (
 
 
 class Ended(NamedTuple):
-    """The end of a session's process.
+    """How a session's process ended.
 
     Attributes:
         rows: its return value; None if it ended before.
@@ -282,7 +282,7 @@ class Ended(NamedTuple):
 
 
 def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memory_limit_mb: float) -> Ended:
-    """Run a function in a process of its own and wait for its end.
+    """Run a function in a separate process and wait for its end.
 
     Args:
         call: "module:function"; it gets the arguments, and a function that sends a row early.
@@ -327,7 +327,7 @@ def _sent(output: bytes) -> tuple[Row, list[Row] | None]:
 
 
 def main() -> None:
-    """Run the function that stdin names in this process, which ends with it or with its parent."""
+    """Run the function named on stdin in this process, which ends with it or with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     order, parent = json.load(sys.stdin), os.getppid()
 
@@ -337,7 +337,7 @@ def main() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    # Messages get a descriptor of their own: libraries print to stdout.
+    # Give messages a separate descriptor: libraries print to stdout.
     messages = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     module, _, name = order["call"].partition(":")

@@ -1,4 +1,4 @@
-"""Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
+"""Convert a point cloud with any fields to a `Scan`: names, units and conventions."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
 
 
 def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
-    """Find the lines and the nearest line of each point (rho, z)."""
+    """Find the lines, and the nearest line to each point (rho, z)."""
     slope = z / rho
     lines = np.zeros((0, 2))
     is_left = rho >= min(3.0, float(np.median(rho)))
@@ -86,7 +86,7 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
 
 
 def _elevation_peaks(elevation: Array) -> Array:
-    """Find elevations in rad that many points share: runs of a histogram above its thin background."""
+    """Find elevations in rad shared by many points: peaks of a histogram above its background."""
     low = elevation.min() - 2 * BIN_RAD
     bins = ((elevation - low) / BIN_RAD).astype(np.intp)
     counts = np.bincount(bins, minlength=int(bins.max()) + 3).astype(np.float64)

@@ -36,14 +36,15 @@ from lce_rig.core.results import Observation
 
 NOMINAL_SIGMA_M = 0.01
 """Residuals for the first weights of captures; weights are reported in units of it."""
-# Share of the plane terms that are kept, those with the least propagated variance.
+# Fraction of the plane terms that are kept: those with the smallest propagated variance.
 _KEPT_SHARE = 0.9
-# A capture's error that still counts as noise: from the median and the scatter of all captures' errors.
+# Largest error attributed to noise: in deviations from the median of all captures, and as a multiple of it.
 _DEVIATIONS, _TIMES_MEDIAN = 6.0, 3.0
-# A disagreement below this can be noise, however well the other captures agree.
+# Smaller disagreements count as noise, even if the other captures agree better, m.
 _FLOOR_M = 0.02
 _MAX_SHARE = 0.25
-# More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
+# Maximum number of folds: larger sessions predict and reject several captures at once, so that the cost stays
+# linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
 # Standard deviation of one capture's board plane between camera and LiDAR.
@@ -180,10 +181,10 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     weak = values < 1 / _MAX_WEAK_SIGMA_M**2
     if not weak.any():
         return
-    # Unit vectors about one direction do not vary along it: the smaller of the two lateral spreads counts.
+    # Unit vectors near one direction do not vary along it, so use the smaller of the two lateral spreads.
     spread = np.linalg.eigvalsh(np.cov(np.array([f.normal for f in features]).T, bias=True))[1]
     finding = UNDETERMINED(
-        # Of each weak direction its main component; translations and rotations are in comparable units.
+        # Main component of each weak direction; translations and rotations have comparable units.
         motions=tuple(dict.fromkeys(MOTIONS[k] for k in np.argmax(np.abs(vectors[:, weak]), axis=0))),
         n_captures=len(features),
         spread_deg=float(np.degrees(np.sqrt(max(spread, 0.0)))),
@@ -228,7 +229,7 @@ def reject_outliers(
     kept = np.arange(problem.n_captures)
     refusals: dict[str, Refusal] = {}
     while True:
-        # Each capture is predicted without its fold; of few captures, each is a fold.
+        # Each capture is predicted without its fold; in small sessions each capture is a fold.
         fold = np.arange(len(kept)) % _MAX_FOLDS
         selection = np.zeros((fold.max() + 1, problem.n_captures))
         selection[:, kept] = fold != np.arange(len(selection))[:, None]
@@ -250,7 +251,7 @@ def reject_outliers(
 
 
 def _excess(errors: Array) -> Array:
-    """Divide errors (F,) by the largest that still counts as noise."""
+    """Divide errors (F,) by the largest error attributed to noise."""
     median = float(np.median(errors))
     deviation = 1.4826 * float(np.median(np.abs(errors - median)))
     return errors / max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)

@@ -1,4 +1,4 @@
-"""The likelihood of one camera's captures under assumptions other than those of its estimate.
+"""Likelihood of one camera's captures under assumptions other than those of its estimate.
 
 It serves to judge an estimate. Every placement has full weight, and the images' errors begin at their usual
 levels. In the estimate, captures that contradict each other lose weight and raise the noise by which they are
@@ -39,7 +39,7 @@ _TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.array([0.0, 0.
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """F captures of one camera under M mountings, settled.
+    """F captures of one camera under M mountings, at the optimum.
 
     Attributes:
         terms: linearised at the optimum; the images of each mounting are those of a camera. Those of a camera
@@ -87,7 +87,7 @@ class Hypothesis:
 
     @cached_property
     def with_fitted_noise(self) -> "Hypothesis":
-        """The same with the levels of the images' errors fitted at the present expansion point."""
+        """Return a copy with the levels of the images' errors fitted at the present expansion point."""
         usual = self.levels.with_usual_images
         fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
         return replace(self, levels=fitted)
@@ -98,7 +98,7 @@ class Hypothesis:
         mounting: NDArray[np.intp] | None = None,
         T_cam_lidar: Array | None = None,
     ) -> "Hypothesis":
-        """Settle under other assumptions.
+        """Find the optimum under other assumptions.
 
         Args:
             priors: of the constants; the present ones by default.

@@ -1,4 +1,4 @@
-"""Options of a live collection, its state at one moment for the views, and its report."""
+"""Options of a live collection, a snapshot of its state for the views, and its report."""
 
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -21,7 +21,7 @@ Key = Literal["stop", "capture", "next"]
 
 @dataclass(frozen=True)
 class TakeBack:
-    """A request to take the last capture of this run back.
+    """A request to reject the last capture of this run.
 
     Attributes:
         name: of the capture shown to the user: another one stays; "" for the last one.
@@ -30,7 +30,7 @@ class TakeBack:
     name: str = ""
 
 
-#: Time for which a board stands still before its capture, beyond the first half second.
+#: Time for which a board must rest before its capture, beyond the first half second, s.
 HOLD_S = 1.5
 
 
@@ -102,7 +102,7 @@ Sound = Literal["tick", "captured", "taken_back", "refused", "enough", "lost"]
 
 
 class StreamState(NamedTuple):
-    """State of one stream, and whether the board is seen in it.
+    """State of one stream, and whether it shows the board.
 
     Attributes:
         name: "cam.frames", "lidar".
@@ -122,7 +122,7 @@ class StreamState(NamedTuple):
 
 
 class Cue(NamedTuple):
-    """A moment that is worth a sound.
+    """An event with a sound.
 
     Attributes:
         number: rises with every cue, so that a view plays each once.
@@ -134,7 +134,7 @@ class Cue(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """The camera's last image, with the present and the wanted outline of the board.
+    """The camera's last image, with the present and the target outline of the board.
 
     Attributes:
         camera: name of the stream.
@@ -156,7 +156,7 @@ class Drawing(NamedTuple):
 
 
 class LiveState(NamedTuple):
-    """One moment of a live collection.
+    """Snapshot of a live collection.
 
     Attributes:
         rig, session: the profile's name and the session's folder.
