@@ -37,8 +37,8 @@ def find_association_error(
 
     Args:
         candidates: captures with the board in both sensors.
-        board: its specification.
-        consensus: of these captures; None if they agree on no extrinsics.
+        board: the board's specification.
+        consensus: consensus of these captures; None if they agree on no extrinsics.
 
     Returns:
         An error if most captures disagree and one error explains them. If the others suffice for extrinsics,

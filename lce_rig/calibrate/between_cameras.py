@@ -36,8 +36,8 @@ class StereoPair(NamedTuple):
 
     Attributes:
         start: T_first_second with the captures that agree.
-        joint: of these captures; the second camera is its base.
-        lenses: of each camera; None for exact ones.
+        joint: joint estimate of these captures; the second camera is its base.
+        lenses: lenses of each camera; None for exact ones.
         rejected: the other captures in which both see the pattern.
     """
 
@@ -55,9 +55,9 @@ def match_cameras(
     """Find the captures that agree on the pose of the second camera in the first one's frame.
 
     Args:
-        images: of both cameras by capture.
+        images: images of both cameras by capture.
         board: the board.
-        settings: of each camera; a lens there is used instead of a new one.
+        settings: settings of each camera; a lens there is used instead of a new one.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsics.

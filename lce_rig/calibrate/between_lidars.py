@@ -81,9 +81,9 @@ def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateS
     """Estimate the poses of the boards relative to the points that one LiDAR's driver reports.
 
     Args:
-        lidars: of F captures.
+        lidars: the board in the scans of F captures.
         board: the plate.
-        settings: what the profile says of this LiDAR.
+        settings: the profile's settings of this LiDAR.
     """
     joint = fit_boards(lidars, board, *what_is_known(settings))
     state, pose_of = joint.state, OWN["pose"]
@@ -108,7 +108,7 @@ def match_lidars(
         candidates: of each capture with the board in both scans; the first LiDAR's poses in its own frame.
         first: by capture the places in its scan where the board may be.
         board: the plate.
-        settings: what the profile says of each LiDAR.
+        settings: the profile's settings of each LiDAR.
 
     Raises:
         NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a

@@ -74,7 +74,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
 
     Args:
         candidates: of each capture, in any order, with all places in the scan where the board may be.
-        board: its size sets the scale at which an angle weighs as much as a distance.
+        board: the board's size sets the scale at which an angle weighs as much as a distance.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsics.

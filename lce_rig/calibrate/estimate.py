@@ -52,9 +52,9 @@ def estimate_extrinsics(
     Args:
         candidates: by channel, of each capture with detections of both sensors; channels whose captures agree
             on no extrinsics are skipped.
-        board: its specification.
+        board: the board's specification.
         settings: method, priors and tolerances.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
         progress: called at each step.
 
     Raises:
@@ -122,8 +122,8 @@ def fit_extrinsic(
     """Estimate T_cam_lidar from both sensors' detections of boards that stood still.
 
     Args:
-        candidates: of each capture with detections of both sensors, in any order.
-        board: its specification.
+        candidates: observations of each capture with detections of both sensors, in any order.
+        board: the board's specification.
         settings: method, priors and tolerances.
 
     Raises:
@@ -146,7 +146,7 @@ def estimate_observations(
 
     Args:
         observations: one per capture.
-        board: its specification.
+        board: the board's specification.
         settings: method, priors and tolerances.
         progress: called at each step.
 

@@ -40,7 +40,7 @@ class LidarErrors:
         n_points: (K,) returns of each laser on boards.
         offset_m: constant error of all ranges, positive if too long; None if not significant.
             It is not part of the lasers' errors in `found`.
-        offset_sigma_m: of it.
+        offset_sigma_m: standard deviation of `offset_m`.
         has_lasers: whether the sessions determine the errors of single lasers, not only that offset.
     """
 

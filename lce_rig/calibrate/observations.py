@@ -91,7 +91,7 @@ def join_scans(
 
     Args:
         agreed: observations of each channel that agree, the most trusted channel first.
-        candidates: of each channel, with all places that each scan offers.
+        candidates: observations of each channel, with all places that each scan offers.
 
     Returns:
         The scans by name, and refusals of images that match another surface of the scan than those of the

@@ -25,9 +25,9 @@ class Tolerances:
     Attributes:
         lens: the intrinsics with theirs.
         square_size: relative.
-        pattern_offset_m: of each coordinate of the pattern's centre on the plate.
-        plate_m: of each side of the plate.
-        bow_m: of the middle's height over the ends, along the width and along the height.
+        pattern_offset_m: standard deviation of each coordinate of the pattern's centre on the plate.
+        plate_m: standard deviation of each side of the plate.
+        bow_m: standard deviation of the middle's height over the ends, along the width and along the height.
     """
 
     lens: LensPrior
@@ -118,8 +118,8 @@ class EstimateSettings(CalibrateOptions):
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
-        tolerances: of the profile's lens and board; None takes both as exact.
-        lens: of the session; None to fit it first, with tolerances.
+        tolerances: tolerances of the profile's lens and board; None takes both as exact.
+        lens: the session's lens; None to fit it first, with tolerances.
     """
 
     laser_bias_sigma_m: float = 0.0

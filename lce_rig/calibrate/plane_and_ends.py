@@ -40,8 +40,8 @@ class CaptureFeatures:
     """The fitted features of one capture.
 
     Attributes:
-        capture: its name.
-        board: its size.
+        capture: the capture's name.
+        board: the board's size.
         plane_points: (N, 3) frame lidar, m.
         edge_points: (M, 3) ring ends, frame lidar, m.
         lidar_normal: (3,) of the board, towards the LiDAR, frame lidar.
@@ -101,7 +101,7 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
 
     Args:
         observation: the boards of both sensors.
-        board: its size.
+        board: the board's size.
         half_step: move ring ends outwards by half an azimuth step, to where the edge is expected: the edge
             lies between the last ray that met the board and the next one. Without it, they are as measured.
     """
@@ -161,7 +161,7 @@ def plane_residuals(f: CaptureFeatures, T_cam_lidar: Array, points: Array | None
     """Evaluate (1) for the points (N, 3) of a capture, by default its plane points: (..., N).
 
     Args:
-        f: of the capture.
+        f: index of the capture.
         T_cam_lidar: (..., 4, 4).
         points: other points of the board, frame lidar.
     """
@@ -173,7 +173,7 @@ def end_residuals(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, NDArra
     """Evaluate (2) without shift for a capture's ring ends and their nearest edges.
 
     Args:
-        f: of the capture.
+        f: index of the capture.
         T_cam_lidar: (..., 4, 4).
 
     Returns:

@@ -43,7 +43,7 @@ class Start:
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        certificate: of Algorithm 1's final cost over all captures used.
+        certificate: certificate of Algorithm 1's final cost over all captures used.
         observations: the F captures used, as measured, sorted by name.
         refused: why each other capture is not used.
         held_out_m: (F,) error of each capture in the fits without it.
@@ -84,7 +84,7 @@ class CalibrationEstimate:
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
-        channels: of the camera, with the time offset of each; empty if they were not separated.
+        channels: channels of the camera, with the time offset of each; empty if they were not separated.
         channel_difference: of the extrinsics of two channels; None if they cannot be compared.
         association: errors by which images and scans of some captures do not belong together.
     """
@@ -206,7 +206,7 @@ def capture_residual(
     Args:
         T_cam_lidar: (4, 4).
         observation: the boards of both sensors.
-        board: its size.
+        board: the board's size.
         held_out_m: passed through.
         squares: size of the squares relative to that by which the image's board was posed.
     """

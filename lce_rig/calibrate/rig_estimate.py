@@ -69,9 +69,9 @@ class _Seen:
 
     Attributes:
         pair: the sensors.
-        capture: its name.
+        capture: the capture's name.
         boards: in the scan of each LiDAR.
-        image: of the camera; None for two LiDARs.
+        image: image of the camera; None for two LiDARs.
     """
 
     pair: SensorPair
@@ -93,7 +93,7 @@ def estimate_rig(
     Args:
         cameras: estimates by the likelihood of cameras and LiDARs whose boards stood still.
         between: pairs of LiDARs, and of cameras. All pairs together connect all sensors.
-        board: its specification.
+        board: the board's specification.
         lidars: names in the order of the profile.
     """
     held = {name for pair in (*cameras, *between) for name in pair}
@@ -177,8 +177,8 @@ class _Frames:
     """Boards and images of n placements in time: captures with the same scan are merged.
 
     Attributes:
-        n: how many.
-        of_capture: number of each capture's.
+        n: number of placements.
+        of_capture: placement number by capture name.
         boards: by LiDAR and number.
         images: by camera and number.
     """

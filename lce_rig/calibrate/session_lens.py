@@ -40,7 +40,7 @@ class SessionLens:
     """A camera's intrinsics and the board's shape, from the profile and the session's images.
 
     Attributes:
-        estimate: of both.
+        estimate: estimate of both.
         prior: the profile's.
     """
 
@@ -137,7 +137,7 @@ def fit_session_lens(
 
     Args:
         images: by channel, of each capture.
-        board: its specification.
+        board: the board's specification.
         prior: the profile's intrinsics.
 
     Raises:

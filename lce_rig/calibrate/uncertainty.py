@@ -47,7 +47,7 @@ def by_scatter(
     Args:
         start: the solution.
         joint: estimate from it, of which the boards' turns are reported.
-        board: its specification.
+        board: the board's specification.
         settings: priors and tolerances.
     """
     scatter = start.cost.jackknife_covariance()
@@ -93,7 +93,7 @@ def moves_by_scans(start: Algorithm1, board: Board) -> tuple[Array, Array, Array
 
     Args:
         start: the solution; its association is held.
-        board: its specification.
+        board: the board's specification.
 
     Returns:
         Tangents (translation m, rotation rad, edge shift m) per m of an error: (L, 7) by the range offset of
@@ -156,9 +156,9 @@ def _sensitivities(
 
     Args:
         start: the solution.
-        board: as the profile says.
+        board: the board of the profile.
         known: standard deviations of the errors.
-        lens: of the session; None leaves its errors out.
+        lens: the session's lens; None ignores its errors.
         of_scans: by source the moves (n, 6) of the result by other errors.
 
     Returns:
@@ -210,10 +210,10 @@ def by_likelihood(
 
     Args:
         start: Algorithm 1's solution.
-        joint: of F captures.
-        board: its specification.
-        lens: of the camera; None if exact.
-        camera: its number.
+        joint: joint estimate of F captures.
+        board: the board's specification.
+        lens: intrinsics of the camera; None if exact.
+        camera: index of the camera.
     """
     moves = joint.cost.moves() @ joint.to_extrinsics[camera].T
     n_placements = len(np.unique(joint.placement[joint.terms.images[camera].capture]))
@@ -242,10 +242,10 @@ def with_errors(
 
     Args:
         start: figures of Algorithm 1.
-        levels: of the noise.
-        state: of the LiDAR; with cameras, also of the squares.
+        levels: noise levels.
+        state: state of the LiDAR; with cameras, also of the squares.
         edge_shift_sigma_m: standard deviation of the edge shift.
-        inflation: of the covariance.
+        inflation: inflation factor of the covariance.
     """
     shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
     return replace(
@@ -274,8 +274,8 @@ def with_corrected_planes(
     """Add the mean plane error of the points after correction of the LiDAR's estimated constant errors.
 
     Args:
-        estimate: of a camera and a LiDAR.
-        board: its size.
+        estimate: estimate of a camera and a LiDAR.
+        board: the board's size.
         rings: (L,) ring numbers of the state's lasers.
         state: the errors.
     """

@@ -323,7 +323,7 @@ def _lacking(
 
     Args:
         wanted: cameras that should have extrinsics.
-        cameras: of which the session holds captures.
+        cameras: cameras of which the session holds captures.
         calibrations: the results, at least one.
     """
     calibrated = {name for c in calibrations for name in (c.camera, c.lidar)}
@@ -358,9 +358,9 @@ def show_result(
 
     Args:
         pairs: the result.
-        poses: of its sensors; None for two.
+        poses: poses of its sensors; None for two.
         rig: the profile.
-        path: of the session.
+        path: path of the session.
         is_explained: whether to print everything that was estimated and tested.
     """
     told: dict[str, str] = {}
@@ -392,7 +392,7 @@ def _parts(
 
     Args:
         c: the result of a pair.
-        path: of the session.
+        path: path of the session.
         told: pair by printed reason; this pair's reasons are added.
         is_explained: whether to print every figure.
         is_of_rig: whether a list of all sensors follows, which has the poses.

@@ -194,7 +194,7 @@ def _causes(
     """List refused captures, grouped by cause and action; causes of the whole session come first.
 
     Args:
-        names: of all captures.
+        names: names of all captures.
         refused: by name.
         plates: findings about the plate's size in all scans.
         session: path, for the commands of actions.

@@ -113,7 +113,7 @@ def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[st
     """State the judgement with its action, the fit, the intrinsics and the main weakness.
 
     Args:
-        measured: of one camera.
+        measured: estimated intrinsics of one camera.
         advice: the action, or "".
         whole: the command that explains all.
     """

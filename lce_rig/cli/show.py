@@ -205,7 +205,7 @@ def progress_bar(title: str, *, has_lines: bool = False) -> Iterator[Progress]:
     """Show a progress bar of this title on stderr.
 
     Args:
-        title: of the work.
+        title: title of the work.
         has_lines: prints lines if stderr is not a terminal; by default, it gets nothing then.
     """
     from rich.console import Console

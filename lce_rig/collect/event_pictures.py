@@ -30,7 +30,7 @@ def with_event_pictures(
     Args:
         samples: scans and packets of events, the earliest first.
         rig: says how images are made.
-        cameras: of whose events images are wanted.
+        cameras: cameras of whose events images are wanted.
         tally: receives why a scan got none.
         is_live: make each image a step of the network instead of an extra run, which is quicker; images
             then depend on which scans came.

@@ -59,7 +59,7 @@ class StillnessGate:
         dwell_s: time after which a capture is taken without waiting for the board to be moved on.
         takes_singles: whether a detection without others in two windows before and after it is a moment, as
             in a recording triggered once per placement; its stillness cannot be checked.
-        window_s: of stillness.
+        window_s: length of the window of stillness.
 
     Attributes:
         motion_m: motion of the board in the last window; infinite without a complete window.

@@ -33,7 +33,7 @@ class Worker:
         """Prepare.
 
         Args:
-            name: of the process, for messages.
+            name: name of the process, for messages.
             make: makes the object there, before its first call; a class or function of a module.
             *arguments: its arguments.
             nice: added to the process's niceness.

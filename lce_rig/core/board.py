@@ -28,10 +28,10 @@ class Board:
         width_m: outer width of the plate.
         height_m: outer height of the plate.
         pattern_offset_m: (x, y) of the pattern's centre from the plate's centre, frame board.
-        type: of the pattern.
+        type: type of the pattern.
         marker_share: side of a ChArUco board's markers over that of its squares.
         gap_share: gap between the tags of an AprilGrid over their side.
-        dictionary: of the markers, OpenCV's name without DICT_.
+        dictionary: dictionary of the markers, OpenCV's name without DICT_.
         first_id: of the markers, at the top left of a ChArUco board and at the lower left of an AprilGrid.
     """
 

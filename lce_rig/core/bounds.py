@@ -34,7 +34,7 @@ def require_file(path: Path, most_bytes: int | None = None) -> None:
     """Refuse devices, pipes and sockets, which have no end, and files that are too large.
 
     Args:
-        path: of a file or folder; one that is missing passes, for its reader to name.
+        path: path of a file or folder; one that is missing passes, for its reader to name.
         most_bytes: largest size; None for files that are read piece by piece.
 
     Raises:

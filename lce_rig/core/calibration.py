@@ -180,7 +180,7 @@ class ChannelResult:
     """One channel of a camera, with its time offset.
 
     Attributes:
-        channel: its name.
+        channel: the channel's name.
         n_captures: captures in which it shows the board and agrees with the others.
         noise_px: corner noise per coordinate, from the residuals of all its images.
         time_offset_s: correction to add to its timestamps, beyond the profile's expected offset, to reach the
@@ -200,7 +200,7 @@ class PointUncertainty:
     """Standard deviations of the position error of LiDAR points transformed to the camera.
 
     Attributes:
-        distance_m: of the point from the camera.
+        distance_m: distance of the point from the camera.
         centre_px, centre_m: in the middle of the image; in it, and in space.
         corner_px, corner_m: in the least certain corner.
     """
@@ -255,7 +255,7 @@ class CaptureResidual(NamedTuple):
     """Residuals of one capture under given extrinsics.
 
     Attributes:
-        capture: its name.
+        capture: the capture's name.
         plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
         edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
         held_out_m: rms of both where the capture was not fitted; of two LiDARs by Algorithm 1, their start.
@@ -286,7 +286,7 @@ class SceneOpinion:
 
     Attributes:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
-        n_edges: of the scans, in or near their images.
+        n_edges: number of edges of the scans, in or near their images.
         state: whether the edges agree with the extrinsics or contradict them; unknown if undetermined.
         change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
         cov: (6, 6) of the change, that of the extrinsics included.
@@ -311,8 +311,8 @@ class Calibration:
     result.json keeps all of it but the last three attributes, which are empty if it is read back.
 
     Attributes:
-        channels: of the camera, names.
-        lidar_channel: of a second camera; "" for a LiDAR.
+        channels: channels of the camera, names.
+        lidar_channel: channel of a second camera; "" for a LiDAR.
         channel_results: time offset and noise of each of these.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
@@ -333,14 +333,14 @@ class Calibration:
         other_cameras: those that saw the same boards held still.
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
             None for those of the profile.
-        lidar_intrinsics: of a second camera, likewise; None for a LiDAR.
+        lidar_intrinsics: intrinsics of the second camera; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
         square_m: the side of a square by the profile and the LiDAR.
         board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
-        residuals: of each capture used.
+        residuals: residuals of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
@@ -461,9 +461,9 @@ class Provenance:
     """Origin of a result; unknown fields are empty.
 
     Attributes:
-        robot: its name, by the profile or `--robot`.
+        robot: the robot's name, from the profile or `--robot`.
         serials: serial numbers by sensor, reported by the devices during the collection, else the profile's.
-        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
+        date: date of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
             without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
         imported: when the last capture came into the session, in the same form; only where `date` is None.
@@ -486,7 +486,7 @@ class SensorPose:
     """The pose of a sensor on the rig's base sensor.
 
     Attributes:
-        sensor: its name.
+        sensor: the sensor's name.
         T_base_sensor: (4, 4) p_base = R p_sensor + t; of a camera, of its optical frame.
         sigma_rotation_deg, sigma_translation_m: roots of the summed variances.
         verdict: the worst of the pairs that the pose is composed of; never "fail".
@@ -517,7 +517,7 @@ class ResultFile:
     """result.json.
 
     Attributes:
-        rig: its name.
+        rig: the rig's name.
         made_by: the program and its version.
         provenance: robot, sensors and date.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.

@@ -196,7 +196,7 @@ class Stream:
 
     Attributes:
         sensor: the camera or LiDAR.
-        channel: of a camera; "" for a LiDAR.
+        channel: channel of a camera; "" for a LiDAR.
         kind: a channel of events may also bring images that others reconstructed.
     """
 

@@ -59,8 +59,8 @@ class NotEnoughDataError(LceRigError):
     """Too few captures, or captures that leave a direction undetermined.
 
     Args:
-        what: as of every error.
-        hint: as of every error.
+        what: as in every error.
+        hint: as in every error.
         finding: the same as code and figures, where a calibration lacks captures.
     """
 
@@ -112,7 +112,7 @@ def reading(
 
     Args:
         path: the file, or words for the message.
-        kind: of the error.
+        kind: kind of the error.
         hint: an action against content that is damaged or of another kind.
         most_bytes: largest size of a file that is read at once.
     """
@@ -179,7 +179,7 @@ def refusal_of(stage: Stage, error: LceRigError, otherwise: str = "collect this 
     """Return the refusal of a capture for an error raised about it.
 
     Args:
-        stage: of the error.
+        stage: stage of the error.
         error: the cause.
         otherwise: the action for unreadable data, if the error names none.
     """

@@ -80,7 +80,7 @@ class Finding:
     """One fact with its figures.
 
     Attributes:
-        code: of its kind, "family.name".
+        code: code of its kind, "family.name".
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
         figures: by name with units ("rms_m"), for the words and for programs.
@@ -212,7 +212,7 @@ class Losses:
 
         Args:
             finding: one of them.
-            n: how many.
+            n: number of placements.
             is_best: keep this one's figures as the example, instead of those of the first.
         """
         if n <= 0:

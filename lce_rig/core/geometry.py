@@ -335,7 +335,7 @@ def relative_covariance(J: Array, cov_second: Array, cov_first: Array) -> Array:
     Args:
         J: (..., 6, 12) derivatives from there.
         cov_second: (..., 6, 6) of the second pose.
-        cov_first: of the first.
+        cov_first: covariance of the first pose.
     """
     by_second, by_first = J[..., :6], J[..., 6:]
     return np.asarray(

@@ -31,7 +31,7 @@ class _Header:
     """The header of a PCD file.
 
     Attributes:
-        dtype: of a point in the file, padding and repeated names included.
+        dtype: dtype of a point in the file, padding and repeated names included.
         kept: names of the fields that are read, with their names in `dtype`.
         n_points: as promised.
         encoding: "ascii", "binary" or "binary_compressed".

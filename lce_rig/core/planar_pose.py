@@ -228,7 +228,7 @@ def linearise_poses(
     The derivative of a point by the tangent is [I, -(R p)^]. Both are zero for hidden corners.
 
     Args:
-        T_cam_board, corners_px, corners_board, project: as of `refine_poses`.
+        T_cam_board, corners_px, corners_board, project: as in `refine_poses`.
     """
     turned = corners_board @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
     pixels, by_point = project(turned + T_cam_board[:, None, :3, 3])

@@ -18,7 +18,7 @@ class ImageQuality:
     Attributes:
         contrast: white minus black squares, grey values.
         square_px: shortest side of a square; 0 if no two neighbours are visible.
-        edge_width_px: of the squares' edges, 10-90 %.
+        edge_width_px: width of the squares' edges, 10-90 %.
         sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
         border_px: distance of the outermost corner from the border of the image.
         n_corners: number of fitted corners.
@@ -64,10 +64,10 @@ class LidarQuality:
         n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
         n_ring_ends_dropped: those that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
-        edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
+        edge_rms_m: rms of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
         beyond_share: returns in the plane beyond the outline over those on the plate.
-        distance_m: of the plate's middle.
+        distance_m: distance of the plate's middle.
     """
 
     width_m: float
@@ -128,7 +128,7 @@ class ImageBoard(BoardPose):
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
         events: figures of the board's events; None if the image was not reconstructed from known events.
-        stamp_ns: of the image; None if the recording carries no time.
+        stamp_ns: timestamp of the image; None if the recording carries no time.
         track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
             the board was tracked; None if there are none.
         track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
@@ -196,7 +196,7 @@ class LidarBoard(BoardSurface):
         sigma_m: rms distance of `points` from the plane.
         offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
         quality: figures of the plate in the scan.
-        stamp_ns: of the scan; None if the recording carries no time.
+        stamp_ns: timestamp of the scan; None if the recording carries no time.
     """
 
     ring: NDArray[np.int16]
@@ -273,8 +273,8 @@ class Observation:
     """One board placement seen by two sensors: a camera channel and a LiDAR, or two sensors of one kind.
 
     Attributes:
-        capture: its name.
-        pose: of the board by the first sensor.
+        capture: the capture's name.
+        pose: pose of the board by the first sensor.
         surface: by the second.
         others: further places where the second sensor may see it.
     """

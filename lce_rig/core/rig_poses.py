@@ -20,7 +20,7 @@ def find_rig_poses(pairs: Sequence[Calibration], lidars: Collection[str]) -> Rig
 
     Args:
         pairs: the results of a session.
-        lidars: of the profile; the first one with a result is the base.
+        lidars: LiDARs of the profile; the first one with a result is the base.
 
     Returns:
         The poses, of LiDARs in the order of the profile, then of cameras; None for two sensors.

@@ -91,9 +91,9 @@ class Pair:
 
     Attributes:
         camera: a camera; the first of two LiDARs.
-        channel: of the camera; "" for a LiDAR.
+        channel: channel of the camera; "" for a LiDAR.
         lidar: a LiDAR; the second of two cameras.
-        lidar_channel: of the second camera; "" for a LiDAR.
+        lidar_channel: channel of the second camera; "" for a LiDAR.
     """
 
     camera: str

@@ -55,7 +55,7 @@ class BoardFinder:
 
     Attributes:
         rig: the profile.
-        board: its board.
+        board: the board to find.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -81,7 +81,7 @@ class BoardFinder:
         """Find the board in one image, starting near its last position.
 
         Args:
-            image: of a camera of the rig.
+            image: image of a camera of the rig.
             last: the board in the image before.
             is_thorough: see `find_image_board`.
 
@@ -106,7 +106,7 @@ class BoardFinder:
         """Find the board's corners with any intrinsics, without the profile's limits on boards.
 
         Args:
-            image: of a camera of the rig.
+            image: image of a camera of the rig.
             intrinsics: at the image's size.
             last: the board in the image before.
             max_reprojection_px: replaces the profile's.
@@ -143,7 +143,7 @@ class BoardFinder:
         """Find surfaces near poses T_lidar_board (4, 4) from the previous scan or predicted.
 
         Args:
-            scan: of a LiDAR of the rig.
+            scan: scan of a LiDAR of the rig.
             poses: at least one; those about which nothing is found are omitted.
         """
         scan = self.rig.corrected(scan)

@@ -47,7 +47,7 @@ class OpenedCamera(NamedTuple):
 
     Attributes:
         input: dv-processing's object, read by its getNext* methods.
-        device: its model, serial number and firmware.
+        device: model, serial number and firmware of the camera.
         notes: settings that differ from those requested.
         serial: its serial number.
     """

@@ -24,7 +24,7 @@ class DiskWriter(Generic[T]):
     writes nothing more.
 
     Attributes:
-        path: of the session or recording.
+        path: path of the session or recording.
         n_written: items written.
         n_dropped: items dropped because the disk was too slow.
         n_waiting: items not written yet.
@@ -41,7 +41,7 @@ class DiskWriter(Generic[T]):
         """Start the thread.
 
         Args:
-            path: of the session or recording, for messages.
+            path: path of the session or recording, for messages.
             write: writes an item; called in the thread.
             finish: called in the thread after the last item.
             most_waiting_bytes: limit of waiting data; items beyond it are dropped.

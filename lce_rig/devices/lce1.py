@@ -205,7 +205,7 @@ class BoardState:
         heard_ns: time of the last message, or of opening the port, by the steady clock.
         hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
-        round_trip_ns: of the last time request.
+        round_trip_ns: round trip of the last time request.
         host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from
             time requests and pulses per second; without a model until there are enough of them.
     """

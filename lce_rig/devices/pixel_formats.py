@@ -19,7 +19,7 @@ class PixelFormat(NamedTuple):
 
     Attributes:
         n_channels: values per pixel in a row; 0 for JPEG files.
-        bits: of a value; above 8 it takes two bytes, low byte first.
+        bits: bits of a value; above 8 it takes two bytes, low byte first.
         conversion: name of OpenCV's conversion to BGR; "" if not needed.
     """
 

@@ -31,7 +31,7 @@ class SourceStatus:
     """State of an attached sensor.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         n_samples: samples handed on since it was opened.
         n_dropped: samples dropped because they were not taken in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
@@ -42,7 +42,7 @@ class SourceStatus:
         serial: its serial number; "" if it has not reported one.
         rates_hz: rates measured by a device of several streams, or with a rotor: "scans", "frames", "events".
         n_packets: data packets received; None for a sensor without packets.
-        n_lost_by_line: of a sync board: pulses lost, by line.
+        n_lost_by_line: lost pulses of a sync board, by line.
     """
 
     sensor: str
@@ -83,7 +83,7 @@ class Inbox(Generic[T]):
         """Queue items; never blocks.
 
         Args:
-            sender: of the items.
+            sender: sender of the items.
             items: in order.
             n_slots: most items of this sender that may wait; beyond, the oldest is dropped.
         """
@@ -156,7 +156,7 @@ class LiveSource(ABC):
     measures rates and reopens lost devices.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         lost: error and time.monotonic() of the loss; None while the sensor is not lost.
         opened_s: time.monotonic() of the first opening; None before.
     """
@@ -167,7 +167,7 @@ class LiveSource(ABC):
         """Prepare without opening the device.
 
         Args:
-            sensor: its name in the profile.
+            sensor: the sensor's name in the profile.
             label: name of the sensor in messages: "camera 'cam'".
             silence_s: longest time without a sample, s; then the sensor counts as lost.
             silence_hint: hint of the error for a lost sensor.

@@ -28,7 +28,7 @@ class Ros2Source(LiveSource):
     Timestamps are those of the headers, which are as good as the publishing driver makes them.
 
     Args:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         settings: its block of the profile.
     """
 

@@ -75,7 +75,7 @@ def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us:
         mark: the moment.
         timing: line time and delay.
         n_rows: H, of the image.
-        exposure_us: of a row; None where unknown, which counts as none.
+        exposure_us: exposure time of a row; None if unknown, which counts as 0.
     """
     half_us, line_us = 0.5 * (exposure_us or 0.0), timing.line_time_us
     rows_us = 0.5 * (n_rows - 1) * line_us
@@ -119,7 +119,7 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, 
     """Choose the clock with 0 <= now - stamp <= 0.2 s; None if no clock fits.
 
     Args:
-        stamp_ns: of an image.
+        stamp_ns: timestamp of an image.
         now_ns: readings of the candidates when it arrived.
 
     Returns:

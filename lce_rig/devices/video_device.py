@@ -222,7 +222,7 @@ def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> s
     """Return the serial number of the USB device behind a video device; "" if unknown.
 
     Args:
-        name: of the video device: "video0".
+        name: name of the video device: "video0".
         system: where the kernel lists video devices.
     """
     try:

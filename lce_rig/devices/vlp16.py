@@ -51,7 +51,7 @@ class Vlp16Source(LiveSource):
     port of data packets (2368); `driver.controls` as `read_controls` reads them.
 
     Args:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         settings: its block of the profile.
         silence_s: time without packets after which it counts as lost.
     """

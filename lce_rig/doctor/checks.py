@@ -345,7 +345,7 @@ class Check:
     Attributes:
         subject: "computer", a sensor's name in the profile, or "rig" for several sensors together.
         name: the item checked, in a word.
-        findings: of the check; those without a subject get the line's.
+        findings: findings of the check; those without a subject get the line's.
     """
 
     subject: str
@@ -376,7 +376,7 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Ch
     Args:
         rig: the profile.
         duration_s: time for which the sensors are watched.
-        folder: of the sessions.
+        folder: folder of the sessions.
 
     Returns:
         A line for each check: of the computer, of each sensor, of the rig.

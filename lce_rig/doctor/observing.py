@@ -28,7 +28,7 @@ class ObservedSensor:
     """Observations of one sensor.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         status: last status of its driver; None if it did not open, or ended before its first sample.
         failure: the error if it could not be opened, or ended early.
         watched_s: time for which it was open.
@@ -82,7 +82,7 @@ class Examination:
 
     Attributes:
         rig: the profile.
-        folder: of the sessions.
+        folder: folder of the sessions.
         seen: observations, by the sensor's name.
     """
 
@@ -109,8 +109,8 @@ def observe(sources: Sequence[LiveSource], duration_s: float) -> dict[str, Obser
     If all sensors are lost, it returns early.
 
     Args:
-        sources: of the sensors.
-        duration_s: how long to watch.
+        sources: live sources of the sensors.
+        duration_s: time to watch the sensors, s.
 
     Returns:
         The observations by the sensor's name.

@@ -53,7 +53,7 @@ class ExportJob:
         calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
         folder: for the files.
-        robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
+        robot: the robot's own tree of frames; None where outputs hang from the profile's `mount` or root.
         session: with the images and scans; None if only results are available.
         findings: content that was left out of the outputs or put into another form, and why; grows.
     """
@@ -102,7 +102,7 @@ class ExportJob:
         """Return the header lines of a file: content, program, whether to use it.
 
         Args:
-            content: of the file.
+            content: content of the file.
             calibrations: those in the file.
             of_one_camera: whether the file is for one camera; else the head names cameras that it lacks.
         """
@@ -199,7 +199,7 @@ def write_exports(
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
         is_forced: write failed calibrations too; every file is then marked as failed.
         session: with images and scans, for formats that show them.
-        robot: its own tree of frames, into which the outputs are to fit.
+        robot: the robot's own tree of frames, into which the outputs are to fit.
         findings: gets those about content that is left out or in another form.
 
     Returns:

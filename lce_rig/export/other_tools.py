@@ -70,7 +70,7 @@ def lens_for(job: ExportJob, format_name: str, camera: str, model: str) -> tuple
     Args:
         job: which gets the finding.
         format_name: for it.
-        camera: its name.
+        camera: the camera's name.
         model: that the format has room for, see `fit_lens`.
 
     Returns:
@@ -249,7 +249,7 @@ class _Entry(NamedTuple):
 
     Attributes:
         key: its name in the file.
-        frame: of the LiDAR's points or the camera's body.
+        frame: frame of the LiDAR's points or the camera's body.
         T_key_frame: (4, 4), which Autoware's description of the sensor adds.
     """
 

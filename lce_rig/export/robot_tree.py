@@ -201,7 +201,7 @@ def fit_tree(
 
     Args:
         robot: its own tree; None for one of the sensors alone, under the profile's `mount` if it has one.
-        calibrations: of the rig's sensors.
+        calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
 
     Returns:

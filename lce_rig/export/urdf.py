@@ -163,7 +163,7 @@ def write_into_urdf(
 
     Args:
         path: the robot's URDF; of a link, the file that it leads to is replaced in one step.
-        calibrations: of the rig's sensors.
+        calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
         now: names the backup, path.urdf.2026-11-22T101500.bak.
 

@@ -91,8 +91,8 @@ class Plan:
     """The changes of a deployment.
 
     Attributes:
-        record: of the release that would be made.
-        state: of the target now.
+        record: record of the release that would be made.
+        state: state of the target now.
         changed: files that differ from the current release's: "changed", "missing", "added".
         sensors: changes of the extrinsics.
         findings: objections, and notes on sets that could not be compared.
@@ -130,9 +130,9 @@ class Deployed:
         release: that is current now.
         replaces: the release that was current before; "" for the first.
         is_new: whether something changed; False if these very files were in place already.
-        output: of the command that ran afterwards; None if none ran.
+        output: output of the command that ran afterwards; None if none ran.
         changed_there: files of the earlier release that were not as they were deployed.
-        remarks: as of `Plan`.
+        remarks: as in `Plan`.
     """
 
     release: ReleaseRecord
@@ -251,7 +251,7 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
 
     Args:
         target: where.
-        name: of the release; None takes the one that the current release replaced.
+        name: name of the release; None takes the one that the current release replaced.
         reason: written down there.
 
     Raises:

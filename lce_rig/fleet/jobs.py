@@ -22,8 +22,8 @@ class Job:
     """One session or recording.
 
     Attributes:
-        source: its path or address, absolute.
-        robot: its name by the manifest; "" if that does not name it.
+        source: the source's path or address, absolute.
+        robot: the robot's name in the manifest; "" without one.
         fallback_robot: its name if the profile does not name it either: the first folder below the root.
         rig: profile that replaces the session's, or that a recording needs; "" for the session's.
     """

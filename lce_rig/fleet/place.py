@@ -275,7 +275,7 @@ class Place:
     """A target's folder, local or remote; no connection is kept between calls.
 
     Attributes:
-        path: of the folder, there.
+        path: path of the folder, there.
         label: the target in words.
     """
 
@@ -305,7 +305,7 @@ class Place:
         """Run a script at the place and return its output; raise if it fails.
 
         Raises:
-            LostError: as of `run`.
+            LostError: as in `run`.
             TargetError: it failed.
         """
         return self.check(self.run(script, *arguments, content=content)).out

@@ -48,7 +48,7 @@ def find_target(name: str, file: Path | None, session: Path, robot: str | None =
     """Find a target in a file.
 
     Args:
-        name: of the target.
+        name: name of the target.
         file: that lists targets; None for deploy.yaml beside the session.
         session: its folder.
         robot: for a target that stands for many.
@@ -74,16 +74,16 @@ class ReleaseRecord(BaseModel):
     """The file .deployed.json of a release.
 
     Attributes:
-        format_version: of this schema.
-        name: of the release: time of deployment, UTC, and the begin of `set_sha256`.
-        time: of deployment, by the clock of the computer that deployed it.
+        format_version: format version of this schema.
+        name: name of the release: time of deployment, UTC, and the begin of `set_sha256`.
+        time: time of deployment, by the clock of the computer that deployed it.
         by: user@computer that deployed it.
         made_by: the program that wrote the files.
         replaces: the release that was current before; "" for the first.
-        reason: of a forced deployment; "" if it was not forced.
+        reason: reason of a forced deployment; "" if it was not forced.
         forced: codes of the objections.
         files: SHA-256 of each file by its path.
-        robot, serials, date, session_sha256: as of the result's provenance.
+        robot, serials, date, session_sha256: as in the result's provenance.
         verdicts: by camera and LiDAR.
     """
 

@@ -58,7 +58,7 @@ class History:
         change: (N, 6) tangent from the pose in the row before, m and rad, axes of the camera; NaN if not
             compared.
         chi2: (N,) of it.
-        limit: of `chi2`.
+        limit: limit of `chi2`.
         robots: state of every robot in the registry.
     """
 
@@ -154,8 +154,8 @@ class FleetReport:
     """The content of a report.
 
     Attributes:
-        registry: its address.
-        n_rows: of its table.
+        registry: the registry's address.
+        n_rows: number of rows of its table.
         history: results compared in time.
         findings: robots that moved.
         verdicts: (verdict, or status of a session without result), rows and robots, the most rows first.

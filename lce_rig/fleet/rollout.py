@@ -31,8 +31,8 @@ class RobotState:
     """One robot in a rollout.
 
     Attributes:
-        robot: its name.
-        folder: of its newest result in the registry.
+        robot: the robot's name.
+        folder: folder of its newest result in the registry.
         state: "waiting" until it was reached.
         to: the place of its files.
         release: the current release there afterwards; "" if unknown.
@@ -59,7 +59,7 @@ class Rollout:
     """The outcome of a rollout.
 
     Attributes:
-        target: its name.
+        target: name of the target.
         stopped_by: the robot that failed and stopped it; "" if none did.
         robots: by name.
     """
@@ -80,7 +80,7 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
     An older result is never used instead, as the sensors may have been moved since.
 
     Args:
-        registry: of the results.
+        registry: registry of the results.
         where: condition in SQL on the rows of the table, as of `Registry.read_table`.
     """
     by_robot: dict[str, list[Mapping[str, Any]]] = {}

@@ -61,7 +61,7 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
 
     Args:
         workers: processes of one thread each; of a running cluster, its own count.
-        memory_limit_mb: of each, beside that of its sessions.
+        memory_limit_mb: memory limit of each, beside that of its sessions.
         scheduler: address of a running one, tcp://...
 
     Raises:
@@ -111,8 +111,8 @@ def run_fleet(
 
     Args:
         jobs: the sessions.
-        settings: of the run.
-        client: of the Dask cluster.
+        settings: settings of the run.
+        client: client of the Dask cluster.
         progress: called with (done, total) sessions.
 
     Raises:

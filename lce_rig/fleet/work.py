@@ -57,10 +57,10 @@ class Settings:
     """Settings of a run, common to its sessions.
 
     Attributes:
-        registry: its path or address.
-        method: of the estimates.
-        time_limit_s: of a session.
-        memory_limit_mb: of its process.
+        registry: the registry's path or address.
+        method: method of the estimates.
+        time_limit_s: time limit of a session.
+        memory_limit_mb: memory limit of its process.
         retry: whether sessions without a result are run again.
     """
 
@@ -85,7 +85,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
 
     Args:
         job: the session.
-        settings: of the run.
+        settings: settings of the run.
         tell: receives the row of the session, with the columns known so far, before the work begins.
 
     Returns:
@@ -230,7 +230,7 @@ def publish(
 
     Args:
         registry: where.
-        rows: of one folder, as `with_pairs` describes them.
+        rows: rows of one folder, as `with_pairs` describes them.
         start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
         saved: the result of the session; None if it has none.
@@ -288,7 +288,7 @@ def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memo
         call: "module:function"; it gets the arguments, and a function that sends a row early.
         arguments: JSON values.
         time_limit_s: after which the process is ended.
-        memory_limit_mb: of data, beyond which its allocations fail.
+        memory_limit_mb: memory limit of data, beyond which its allocations fail.
     """
     order = {"call": call, "arguments": dict(arguments), "memory_limit_mb": memory_limit_mb}
     try:

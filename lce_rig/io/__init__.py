@@ -67,7 +67,7 @@ def open_recordings(
     """Open the recordings at several paths; for a folder filled by several recorders, each of its files.
 
     Args:
-        paths: of the recordings.
+        paths: paths of the recordings.
         rig: the profile.
         options: one for all recordings, or one per path.
 

@@ -44,7 +44,7 @@ def measure_elevations(scan: Scan) -> Array:
     distance rho from the axis: z / rho is fitted against 1 / rho for each ring.
 
     Args:
-        scan: of at least a few metres around, in the LiDAR's own frame.
+        scan: scan of at least a few metres around, in the LiDAR's own frame.
 
     Returns:
         (L,) deg, in the order of the rings' numbers.
@@ -70,8 +70,8 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
     """Compare the rings of a scan with the beams of the profile's model.
 
     Args:
-        scan: of one revolution, in the LiDAR's own frame.
-        settings: of the LiDAR.
+        scan: scan of one revolution, in the LiDAR's own frame.
+        settings: settings of the LiDAR.
 
     Returns:
         Beams of another model, with those that fit; rings or points that are missing regularly.

@@ -67,8 +67,8 @@ class CameraDescription:
         binning: pixels of the sensor per pixel of the images, in x and y.
         roi_px: (x offset, y offset, width, height) that is read out, at the full size; a width and height of
             zero for all of it.
-        name: of the camera, or "".
-        topic: of its images, or "".
+        name: name of the camera, or "".
+        topic: topic of its images, or "".
     """
 
     K: Array
@@ -216,8 +216,8 @@ class CameraFile:
         """Return a camera's intrinsics and notes, see `CameraDescription.intrinsics`.
 
         Args:
-            name: of the camera, which chooses among several.
-            topics: of its images, which choose among several, too.
+            name: name of the camera, which chooses among several.
+            topics: topics of its images, which choose among several, too.
             image_px: (width, height) of its images; None if unknown.
 
         Raises:
@@ -315,7 +315,7 @@ def _describe(data: Any, name: str = "", depth: int = 0) -> Iterator[CameraDescr
     Args:
         data: as a parser of YAML returns it.
         name: key of the mapping.
-        depth: of the mapping.
+        depth: nesting depth of the mapping.
 
     Raises:
         ValueError: a camera that cannot be used.

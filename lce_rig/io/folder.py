@@ -205,7 +205,7 @@ class FileOnDisk:
     Attributes:
         label: its name, for messages; with its folder's where several sensors may have the same names.
         sensor, channel: that it belongs to; a LiDAR has no channel.
-        settings: of the LiDAR; None of an image.
+        settings: settings of the LiDAR; None of an image.
     """
 
     path: Path
@@ -331,7 +331,7 @@ def read_pairs(
     """Read pairs: label, images and scans of each; damaged ones are skipped.
 
     Args:
-        pairs: of a `FolderRecording`.
+        pairs: pairs of a `FolderRecording`.
         notes: receives the pairs that were skipped.
         progress: called with (done, total).
 

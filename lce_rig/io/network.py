@@ -100,7 +100,7 @@ class PcapFile:
         Args:
             explain: returns the reason for a datagram that is not from the LiDAR; "" for one that is.
             what: description of the LiDAR, for messages.
-            lidar: its name in the profile.
+            lidar: the LiDAR's name in the profile.
             driver: its `driver` there.
 
         Raises:

@@ -32,8 +32,8 @@ class Profile(NamedTuple):
 
     Attributes:
         pixel: one return.
-        unit_m: of its range.
-        range_mask: of the bits that hold the range.
+        unit_m: unit of its range.
+        range_mask: mask of the bits that hold the range.
         has_heads: whether packets have a head and a foot, and a column's status is in its head.
     """
 
@@ -67,9 +67,9 @@ class OusterMetadata:
     """The sensor's metadata, as far as its packets need them.
 
     Attributes:
-        name: of its profile.
+        name: name of its profile.
         n_columns: columns of a revolution.
-        columns_per_packet: of one packet.
+        columns_per_packet: columns of one packet.
         altitude_rad, azimuth_rad: (L,) of each beam, from the top.
         origin_m: (2,) distance of the beams' origins from the axis, and their height.
         T_sensor_lidar: (4, 4), m.

@@ -214,8 +214,8 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
     """Pass samples on; at their end, check that images and events ran while a LiDAR did.
 
     Args:
-        samples: of a whole recording.
-        rig: its `expected_offset_s` are added to the timestamps.
+        samples: samples of a whole recording.
+        rig: profile whose `expected_offset_s` are added to the timestamps.
         notes: receives the streams that cover only a part of the scans.
 
     Raises:
@@ -368,7 +368,7 @@ class JoinedRecording:
     """Several simultaneous recordings; see `ContinuousRecording`.
 
     Attributes:
-        path: of the first.
+        path: path of the first recording.
         notes: those of all, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.

@@ -44,7 +44,7 @@ class DataPacket:
     Attributes:
         host_ns: arrival at the host; 0 where unknown.
         us: time of the first firing past the hour, on the sensor's counter.
-        mode: of velodyne.RETURN_MODES.
+        mode: return mode, a key of velodyne.RETURN_MODES.
         product: the model that sent it.
         azimuth: (12,) int64 of each block, 0.01 deg clockwise from the lidar frame's x axis.
         fields: () of velodyne.DATA_PACKET.
@@ -100,7 +100,7 @@ def read_data_packet(
     a time within the hour, known factory bytes.
 
     Args:
-        payload: of the UDP packet.
+        payload: payload of the UDP packet.
         host_ns: its arrival; 0 where unknown.
         wanted: the model whose packets are read.
 
@@ -210,7 +210,7 @@ class VelodyneClock:
 
         Args:
             packet: in its place.
-            elapsed_ns: of the counter since any fixed moment.
+            elapsed_ns: reading of the counter since any fixed moment.
         """
         self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
         if not packet.host_ns:

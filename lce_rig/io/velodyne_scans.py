@@ -77,7 +77,7 @@ class _Piece(NamedTuple):
 
     Attributes:
         packet: the whole packet.
-        elapsed_ns: of the counter at the packet's first firing.
+        elapsed_ns: reading of the counter at the packet's first firing.
         blocks: the slice of its blocks.
     """
 
@@ -95,7 +95,7 @@ class Vlp16Stream:
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
         product: the model whose packets are decoded.
         other_models: data packets of other models, by name.
-        clock: of the timestamps.
+        clock: clock of the timestamps.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
 
@@ -156,7 +156,7 @@ class Vlp16Stream:
         """Decode a data packet; return the scan that it completes. A bad one is counted.
 
         Args:
-            payload: of the UDP packet.
+            payload: payload of the UDP packet.
             host_ns: its arrival; 0 where unknown.
         """
         try:

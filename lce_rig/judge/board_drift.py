@@ -178,8 +178,8 @@ def watch_boards(
     Args:
         rig: the profile.
         calibration: the deployed extrinsics.
-        channel: of the images.
-        detections: of the captures.
+        channel: channel of the images.
+        detections: detections of the captures.
 
     Returns:
         None if both sensors see the board at about the same place in fewer than three placements.

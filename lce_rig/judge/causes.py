@@ -46,7 +46,7 @@ def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]
     """Weigh all captures of an estimate fully, to test explanations of them; None if they are too few.
 
     Args:
-        estimate: of any method.
+        estimate: estimate of any method.
         rejected: captures with the board in both sensors that the estimate does not use.
     """
     if estimate.joint is None or len(estimate.observations) < _FEWEST:
@@ -69,7 +69,7 @@ def find_causes(
 
     Args:
         hypothesis: the likelihood of its captures.
-        estimate: of any method.
+        estimate: estimate of any method.
         target: target standard deviations.
         causes: to test; only mountings for two LiDARs, or two cameras.
     """

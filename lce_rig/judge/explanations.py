@@ -105,7 +105,7 @@ class Explanation:
     """A cause that may explain why captures disagree.
 
     Attributes:
-        cause: its kind.
+        cause: the cause's kind.
         weights: (F,) w of (1).
         n_tried: number of explanations of this kind.
         cut: index of the first capture after a move ("moved"), or of another board ("two_boards").
@@ -142,7 +142,7 @@ class Selected(NamedTuple):
     """An explanation that was assumed.
 
     Attributes:
-        gain: its significance and estimate.
+        gain: the gain's significance and estimate.
         change: (6,) tangent (translation m, rotation rad) by which it changes the extrinsics. For mountings:
             from before to after, or from the rest to the group.
         after: the likelihood with it.

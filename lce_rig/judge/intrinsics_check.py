@@ -133,7 +133,7 @@ def check_intrinsics(
     """Compare intrinsics with the corners of detected boards.
 
     Args:
-        image_boards: of one camera, by capture and channel.
+        image_boards: image boards of one camera, by capture and channel.
         intrinsics: the intrinsics to check.
         board: the board.
 
@@ -153,7 +153,7 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
     """Compare intrinsics with fitted ones.
 
     Args:
-        fitted: of any model.
+        fitted: the fitted intrinsics, of any model.
         intrinsics: the intrinsics to check, at the same resolution.
         board: the board.
     """
@@ -192,7 +192,7 @@ def judge_lens(
 
     Args:
         covered: share of the image in which boards were seen.
-        image_sigma_px: of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
+        image_sigma_px: uncertainty of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
         check: the profile's intrinsics compared with them; None if they are for another resolution.
         target_deg: target standard deviation of the extrinsics' rotation.
 
@@ -213,7 +213,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
     """Return the finding of given intrinsics that do not fit, with their difference; else none.
 
     Args:
-        check: of the intrinsics.
+        check: result for the intrinsics.
         target_deg: target standard deviation of the extrinsics' rotation.
     """
     if check is None or check.verdict(target_deg) == "pass":
@@ -240,7 +240,7 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
 
     Args:
         fitted: intrinsics of the profile's model.
-        board: its specification.
+        board: the board's specification.
 
     Returns:
         None where the corners fit, or where the same model fits them with values of its own; else the

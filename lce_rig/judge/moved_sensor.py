@@ -76,7 +76,7 @@ class MovedSensor:
     """A sensor that moved.
 
     Attributes:
-        name: of the sensor.
+        name: name of the sensor.
         first_after: the first capture after its motion.
         log10_chance: log10 of the probability of such a fall of the cost without a motion.
         shown: the motion as captures of one of its pairs show it.
@@ -135,7 +135,7 @@ def find_moved_sensor(pairs: Sequence[PairCosts]) -> MovedSensor | None:
     """Find the sensor whose motion explains the captures of all pairs best.
 
     Args:
-        pairs: of a rig.
+        pairs: pairs of a rig.
 
     Returns:
         The sensor; None if no pair's captures show a motion, or if several sensors explain them as well.

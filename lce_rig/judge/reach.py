@@ -112,8 +112,8 @@ def point_uncertainties(
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) tangent (translation m, rotation rad), or (6 + P, 6 + P) `with_lens`.
-        lens: of the camera.
-        distances_m: of the points.
+        lens: intrinsics of the camera.
+        distances_m: distances of the points.
 
     Returns:
         One for each distance, with the worst of the four corners.

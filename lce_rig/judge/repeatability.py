@@ -58,7 +58,7 @@ class Repeatability:
     """Several calibrations of the same sensors, compared.
 
     Attributes:
-        names: of the sessions, or of the results of one session.
+        names: names of the sessions, or of the results of one session.
         camera, lidar: the calibrated sensors.
         T_cam_lidar: (4, 4) mean with equal weights, of extrinsics for the first one's intrinsics.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
@@ -67,7 +67,7 @@ class Repeatability:
         chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
         dof: its mean if these are right.
         p: probability that correct calibrations spread this far or farther.
-        differences: of each pair.
+        differences: differences of each pair.
         odd_one: the session without which the others agree; None if all agree or none can be identified.
         are_independent: whether each has its own captures. If not, common errors stay hidden, and chi2, dof
             and p are those of the pair that differs most, with p times the number of pairs.

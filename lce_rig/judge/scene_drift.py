@@ -69,7 +69,7 @@ class SceneDrift:
     Attributes:
         T_cam_lidar: (4, 4) deployed.
         cov: (6, 6) of these.
-        estimate: of the scene.
+        estimate: estimate of the scene.
         n_captures: compared.
         gain: significance of an ambiguous estimate's score over that of the deployed extrinsics.
         others: further findings; clocks apart prevent an all-clear.
@@ -166,7 +166,7 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
 
     Args:
         views: the captures.
-        lens: of the camera.
+        lens: intrinsics of the camera.
         calibration: the extrinsics and their covariance.
     """
     c = calibration

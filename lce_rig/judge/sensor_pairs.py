@@ -66,8 +66,8 @@ class RelativePose:
             between placements.
         captures: (F,) that both cameras used, as the first names them.
         board_rms_m: rms distance between both cameras' positions of a board's middle.
-        scatter: of single boards about it, in typical standard deviations of poses in images.
-        expansion: of the cost about T_second_first, per capture.
+        scatter: scatter of single boards about it, in typical standard deviations of poses in images.
+        expansion: expansion of the cost about T_second_first, per capture.
         centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
@@ -104,7 +104,7 @@ def shared_boards(
 
     Args:
         first: observations by capture, of one camera.
-        second: of the other.
+        second: name of the other sensor.
     """
     there = {scan_key(observation): observation for observation in second.values()}
     found = [(observation, there.get(scan_key(observation))) for observation in first.values()]
@@ -191,9 +191,9 @@ class CameraEvidence(NamedTuple):
     """A calibrated camera, as far as its name can be wrong.
 
     Attributes:
-        name: of the camera.
+        name: name of the camera.
         T_cam_lidar, cov: its extrinsics, (4, 4) and (6, 6).
-        views: of the board in its images.
+        views: views of the board in its images.
         lens: the profile's lens compared with them.
     """
 
@@ -214,7 +214,7 @@ def find_exchanged_cameras(
 
     Args:
         rig: the profile, with both cameras.
-        lidar: of both.
+        lidar: name of the common LiDAR.
         first, second: the cameras.
     """
     reasons = []
@@ -255,7 +255,7 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
 
     Args:
         pair: the cameras.
-        names: of the first and the second.
+        names: names of the first and the second.
         target: standard deviations to reach.
     """
     if pair.from_images is None or pair.apart is None:
@@ -300,8 +300,8 @@ def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetec
     """Find a LiDAR whose scans have rings that its model lacks, as when two came under each other's name.
 
     Args:
-        name: of the LiDAR.
-        lidar: its settings.
+        name: name of the LiDAR.
+        lidar: the LiDAR's settings.
         scans: its detections.
     """
     sheet = lidar.data_sheet()
@@ -325,8 +325,8 @@ def find_exchanged_lidars(
 
     Args:
         T_first_second: (4, 4) the estimate.
-        nominal: of the profile.
-        names: of both.
+        nominal: nominal extrinsics of the profile.
+        names: names of both sensors.
         lidars: their settings.
     """
     if nominal is None:
@@ -346,7 +346,7 @@ class Loop(NamedTuple):
     """A sensor calibrated to two LiDARs, and these to each other.
 
     Attributes:
-        names: of the sensor and both LiDARs.
+        names: names of the sensor and both LiDARs.
         first, between, second: pose (4, 4) of the first LiDAR in the sensor's frame, of the second in the
             first one's, and of the second in the sensor's, each with its covariance (6, 6).
     """

@@ -116,7 +116,7 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
 
     Args:
         candidates: detections of both sensors.
-        board: its size weighs angles against distances.
+        board: the board's size weighs angles against distances.
         T_cam_lidar: (4, 4).
     """
     poses = [candidates.pose.T_cam_board]
@@ -146,7 +146,7 @@ class SessionCheck:
         pair: the sensors.
         calibration: the calibration to check.
         findings: why these captures contradict it; empty if they agree.
-        residuals: of each capture in which both sensors see the board.
+        residuals: residuals of each capture in which both sensors see the board.
         metrics: their summary; None without any.
         scene: the opinion of the scene's edges on the extrinsics.
         meetings: by capture, the boards of the residuals.
@@ -211,9 +211,9 @@ def check_session(
 
     Args:
         rig: the session's.
-        detections: of the session.
+        detections: detections of the session.
         calibration: the extrinsics; they may come from another session of the same rig.
-        channel: of the calibration's channels.
+        channel: one of the calibration's channels.
         scene: the opinion of this session's scene.
     """
     pair = replace(Pair.of(calibration), channel=channel)
@@ -271,8 +271,8 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
     """Find contradictions of captures and extrinsics: large residuals, or no board at the expected place.
 
     Args:
-        metrics: of the captures in which both sensors agree on the board's place; None without any.
-        rig: its limits.
+        metrics: metrics of the captures in which both sensors agree on the board's place; None without any.
+        rig: the profile with the limits.
         n_elsewhere: captures without a surface in the scan near the camera's detection. One such capture may
             be a board that the LiDAR missed among objects of its size; many are a contradiction.
         n_seen: captures with detections of both sensors.
@@ -296,10 +296,10 @@ def find_meetings(
 
     Args:
         rig: the profile.
-        detections: of the captures.
+        detections: detections of the captures.
         pair: the sensors.
         T_cam_lidar: (4, 4) the extrinsics.
-        results: of the channels of the calibration.
+        results: results of the channels of the calibration.
 
     Returns:
         By name of the capture.

@@ -164,7 +164,7 @@ def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration
 
     Args:
         calibration: judged by its boards.
-        opinion: of the scene without the board.
+        opinion: the check on the scene without the board.
     """
     return with_findings(replace(calibration, scene=opinion), scene_findings(opinion, calibration))
 
@@ -173,7 +173,7 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
     """List the scene's contradiction of extrinsics, if there is one, with the likely cause as its action.
 
     Args:
-        opinion: of the scene.
+        opinion: the check on the scene.
         calibration: the extrinsics.
         action: if known already.
     """
@@ -333,7 +333,7 @@ def plate_findings(scans: Iterable[BoardSurface | Refusal], board: Board) -> lis
     Args:
         scans: boards, of which those in scans count, and refusals: a plate refused for its size counts as
             measured.
-        board: of the profile.
+        board: board of the profile.
     """
     sizes: dict[str, list[tuple[float, float]]] = {"width": [], "height": []}
     dropped, n_lacking = [], {"width": 0, "height": 0}
@@ -382,7 +382,7 @@ def distance_findings(
 
     Args:
         in_camera, in_lidar: (N, 3) centres of the boards of N captures, m.
-        square_m: of the profile.
+        square_m: square size of the profile.
         n_misfits: images whose corners fit no pose of the board. Wrong squares cause none, a wrong lens does.
     """
     first, second = np.triu_indices(len(in_camera), 1)

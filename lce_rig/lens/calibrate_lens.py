@@ -68,10 +68,10 @@ def estimate_intrinsics(
     prior counts.
 
     Args:
-        views: of at least `MIN_CAPTURES` captures.
+        views: views of at least `MIN_CAPTURES` captures.
         board: the board.
         start: an initial guess at the images' resolution; it may be wrong by a third.
-        model: of the lens to fit.
+        model: model of the lens to fit.
         prior: the profile's intrinsics; None to use the boards alone.
         n_folds: number of cross-validation folds; 0 for none.
 

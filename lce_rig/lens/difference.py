@@ -73,7 +73,7 @@ def compare_lenses(
         first, second: for images of the same size.
         corners_px: (n, 2) where boards were seen.
         cov: (P, P) of the second's parameters.
-        model: of the second, whose parameters these are.
+        model: model of the second, whose parameters these are.
 
     References:
         D. Kogan, mrcal: projection difference and implied transformation.

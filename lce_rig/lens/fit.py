@@ -49,7 +49,7 @@ class Setup:
         shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
         mean: (P + S,) lens and shape a priori.
         information: (P + S, P + S) of it.
-        model: of the lens.
+        model: model of the lens.
         is_lens_free: whether the intrinsics are fitted; else only the board's shape and the poses are.
     """
 
@@ -70,8 +70,8 @@ class Setup:
         Args:
             corners_px: as measured.
             board: the board.
-            model: of the lens.
-            prior: of lens and board; None without one of the lens.
+            model: model of the lens.
+            prior: prior information of lens and board; None without one of the lens.
 
         References:
             D. Kogan, mrcal: the deformed calibration object.
@@ -279,7 +279,7 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
     """Compute how far fitted poses move with lens and board.
 
     Args:
-        estimate: of both.
+        estimate: estimate of both.
         corners_px: (K, N, 2) of boards.
         T_cam_board: (K, 4, 4) of these.
         errors: (n, P + 15) added to lens and shape.

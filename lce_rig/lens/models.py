@@ -168,8 +168,8 @@ class LensPrior:
     Attributes:
         lens: the intrinsics.
         focal_length: standard deviation of both focal lengths alike, relative.
-        principal_point_px: of each coordinate.
-        distortion_px: of a pixel's displacement in the image's corner.
+        principal_point_px: standard deviation of each coordinate.
+        distortion_px: standard deviation of a pixel's displacement in the image's corner.
         is_board_exact: whether the board has its nominal shape.
     """
 

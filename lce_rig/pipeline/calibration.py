@@ -85,8 +85,8 @@ class _Solved:
         pairs: channels of the camera with the LiDAR.
         settings: the user's options, with the LiDAR's properties from the profile.
         refused: why captures without the board in both sensors are unusable.
-        estimate: of the extrinsics.
-        validation: of the estimate on the camera's own captures and images.
+        estimate: estimate of the extrinsics.
+        validation: validation of the estimate on the camera's own captures and images.
         lacking: why channels of the camera are not part of it.
         together: the joint estimate that includes it; None if it was estimated separately.
     """
@@ -167,7 +167,7 @@ def calibrate_session(
     Args:
         session: its folder, or one that is open for reading.
         detections: of the session; None detects the board first, as `detect_boards` does by default.
-        options: of the estimate; None for the defaults.
+        options: options of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
@@ -223,8 +223,8 @@ def calibrate_detections(
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
-        detections: of one session.
-        options, cameras, channels, progress: as of `calibrate_session`.
+        detections: detections of one session.
+        options, cameras, channels, progress: as in `calibrate_session`.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.

@@ -58,12 +58,12 @@ class MeasuredIntrinsics:
     """A camera's intrinsics from the boards of a session, compared with the profile's.
 
     Attributes:
-        camera: its name.
+        camera: the camera's name.
         channels: the channels whose images were used.
         given: the profile's intrinsics.
         estimate: the intrinsics from the boards.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
-        certainty: of the estimate, per pixel.
+        certainty: uncertainty of the estimate, per pixel.
         judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
             another lens model that fits them.
         misfit: how the profile's do not fit; None if they do, or are for another resolution.
@@ -116,7 +116,7 @@ def measure_intrinsics(
 
     Args:
         session: open for reading is enough.
-        camera: its name.
+        camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
         model: name of a lens model; the profile's if None.

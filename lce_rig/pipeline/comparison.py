@@ -24,7 +24,7 @@ class Repeat:
     """Sessions of one rig, or results of one session, compared.
 
     Attributes:
-        rig: its name.
+        rig: the rig's name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
         findings: errors name sessions whose own calibration has failed; warnings state limits.
     """
@@ -43,8 +43,8 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
     """Compare the results that one session holds, such as those of frames and of events.
 
     Args:
-        folder: of the session.
-        names: of the results; all but the previous one where empty.
+        folder: folder of the session.
+        names: names of the results; if empty, all but the previous one.
 
     Raises:
         UsageError: fewer than two results; or a name is given twice, or cannot be one.
@@ -76,8 +76,8 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
     Args:
-        folders: of the sessions.
-        name: of the result to take from each; None for the one in calibration/.
+        folders: folders of the sessions.
+        name: name of the result to take from each; None for the one in calibration/.
 
     Raises:
         UsageError: fewer than two sessions, or one given twice.

@@ -108,7 +108,7 @@ def unlike_models(session: Session, detections: Detections) -> list[Finding]:
 
     Args:
         session: open for reading is enough.
-        detections: of the session.
+        detections: detections of the session.
     """
     found: list[Finding] = []
     for lidar, by_capture in detections.lidars.items():

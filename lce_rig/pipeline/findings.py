@@ -79,7 +79,7 @@ def absent_channels(
 
     Args:
         rig: with the channels.
-        detections: of the session.
+        detections: detections of the session.
         wanted: names of the channels that are used; None for all.
     """
     cameras = {camera for camera, _ in detections.images}

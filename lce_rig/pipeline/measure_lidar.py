@@ -46,7 +46,7 @@ def measure_lidar(
 
     Args:
         sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
-        lidar: its name in the profiles; None for the only one.
+        lidar: the LiDAR's name in the profiles; None for the only one.
         found: detections of each session; None detects the board first.
         progress: called with (done, total) while a session is read.
 

@@ -90,7 +90,7 @@ def new_profile(
     """Write the text of a profile.
 
     Args:
-        name: of the rig.
+        name: name of the rig.
         board: as it was measured.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
             folder with images and point clouds. The beams of an unknown LiDAR are measured in it.
@@ -210,7 +210,7 @@ def _lidar(
     """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows.
 
     Args:
-        name: of the LiDAR.
+        name: name of the LiDAR.
         model: as it was named.
         notes: receives differences between the rings of cloud and model.
         topic: that the cloud is from; None without a bag.
@@ -271,7 +271,7 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
     """Measure a LiDAR's beams in one of its scans.
 
     Args:
-        scan: of at least a few metres around, in the LiDAR's own frame.
+        scan: scan of at least a few metres around, in the LiDAR's own frame.
 
     Returns:
         The elevation of each ring in deg, from the lowest; firings of each ring per revolution, None where

@@ -45,9 +45,9 @@ class Seen(NamedTuple):
     """One capture of one camera and LiDAR.
 
     Attributes:
-        name: of the capture, or its time.
-        image: of the camera; without one, 20 ms of events.
-        scan: of the LiDAR.
+        name: name of the capture, or its time.
+        image: image of the camera; without one, 20 ms of events.
+        scan: scan of the LiDAR.
         previous: the scan before, in a continuous recording.
     """
 

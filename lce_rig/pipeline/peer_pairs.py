@@ -41,8 +41,8 @@ class SolvedPeers:
         n_detected: captures with a board in both.
         refused: why others are unusable.
         given: the captures that agree.
-        estimate: of the second one's pose, of LiDARs in an optical frame of the first.
-        validation: of the estimate.
+        estimate: estimate of the second one's pose, of LiDARs in an optical frame of the first.
+        validation: validation of the estimate.
     """
 
     pair: Pair
@@ -95,10 +95,10 @@ def solve_peers(
 
     Args:
         rig: the profile.
-        detections: of the session.
-        pairs: of two LiDARs or two cameras.
-        options: of the estimate; the method is always of maximum likelihood.
-        lenses: of cameras that have one already.
+        detections: detections of the session.
+        pairs: pairs of two LiDARs or two cameras.
+        options: options of the estimate; the method is always of maximum likelihood.
+        lenses: lenses of cameras that have one already.
         progress: told what is done.
 
     Returns:

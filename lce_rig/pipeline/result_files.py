@@ -145,7 +145,7 @@ class Result:
         """Draw report.html beside the result.json that `write` has written.
 
         Args:
-            name: as of `write`.
+            name: as in `write`.
 
         Raises:
             SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
@@ -176,7 +176,7 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
 
     Args:
         session: the session's folder.
-        name: of the result; None for the main one, in calibration/.
+        name: name of the result; None for the main one, in calibration/.
         is_new: whether it is to be written.
 
     Raises:
@@ -202,7 +202,7 @@ def with_profile_of(session: Session, name: str | None) -> Session:
 
     Args:
         session: open for reading is enough.
-        name: of the result; None for the one in calibration/, whose profile is the session's.
+        name: name of the result; None for the one in calibration/, whose profile is the session's.
 
     Raises:
         UsageError, ProfileError, SessionError: the name, or the profile there, cannot be used.
@@ -224,7 +224,7 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration], profile
     A manifest holds the SHA-256 of the capture's files.
 
     Args:
-        session: of the captures.
+        session: the session with the captures.
         calibrations: the results.
         profile: content of rig.yaml beside the result, else in the session.
 
@@ -303,7 +303,7 @@ class StoredResult(NamedTuple):
     Attributes:
         name: "current" and "previous" for those in calibration/, else the name of `calibrate --name`.
         folder: with its result.json.
-        file: its content; None if it cannot be read.
+        file: the file's content; None if it cannot be read.
         problem: why it cannot be read; "" if it can.
         written_s: when it was written, seconds since 1970.
         is_outdated: whether the profile or a capture that it used has changed or is missing.

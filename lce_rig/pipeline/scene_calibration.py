@@ -81,7 +81,7 @@ class View:
     """The samples of one time.
 
     Attributes:
-        name: of the capture that holds them.
+        name: name of the capture that holds them.
         images, scans: of all sensors; scans as recorded.
         previous: the scans before, by LiDAR; empty where the recording is not continuous.
     """
@@ -157,7 +157,7 @@ def calibrate_scene(
     """Estimate the extrinsics of every camera with every LiDAR from a scene without a board.
 
     Args:
-        recordings: of one time: folders of images and point clouds, bags, files; or one session.
+        recordings: recordings of one time: folders of images and point clouds, bags, files; or one session.
         session: folder of the session that holds the views; is created. That of a session is the session.
         rig: the profile; None for that of the session.
         cameras: those to calibrate; empty for all.

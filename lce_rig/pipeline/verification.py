@@ -47,9 +47,9 @@ class Verification:
         session: the source of the captures.
         checks: one for each channel of a camera and LiDAR with captures in the session.
         calibrations: the extrinsics, including those of sensors without captures.
-        detections: of the session.
+        detections: detections of the session.
         own_result: content of the session's result.json if the calibrations come from it, else None.
-        name: of that result; None for the one in calibration/.
+        name: name of that result; None for the one in calibration/.
         notes: differences between the profiles of session and result.
     """
 
@@ -137,10 +137,10 @@ def verify(
 
     Args:
         session: may differ from the session that the extrinsics come from.
-        result: of `calibrate` or `read_result`; None for the session's result.json.
-        name: of the session's result to check; None for the one in calibration/.
+        result: result of `calibrate` or `read_result`; None for the session's result.json.
+        name: name of the session's result to check; None for the one in calibration/.
         profile: with which the result was made, as `profile_behind` finds it: its lenses count.
-        detections: of this session; None to detect the board first.
+        detections: detections of this session; None to detect the board first.
         progress: called with (done, total) while the board is detected.
 
     Raises:
@@ -206,8 +206,8 @@ def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, .
     Another lens moves boards and edges, and would look like a sensor that moved.
 
     Args:
-        rig: of the samples.
-        profile: of the result; None if unknown.
+        rig: profile of the sensors that recorded the samples.
+        profile: profile of the result; None if unknown.
     """
     if profile is None:
         return rig, ()
@@ -259,7 +259,7 @@ def write_debug_images(
 
     Args:
         session: the source of the captures.
-        detections: of the session.
+        detections: detections of the session.
         progress: called with (done, total).
 
     Returns:

@@ -69,7 +69,7 @@ class SceneCaptures:
     Args:
         rig: the profile.
         result: the deployed extrinsics.
-        source: its name in messages.
+        source: the source's name in messages.
 
     Attributes:
         kept: by index of the result's pairs.
@@ -286,7 +286,7 @@ def drift_live(
     Args:
         rig: the profile.
         result: the deployed extrinsics.
-        sources: of every sensor and of the sync board; not open yet.
+        sources: live sources of every sensor and of the sync board; not open yet.
         is_over: asked several times a second with the number of scans so far; True ends it.
 
     Raises:

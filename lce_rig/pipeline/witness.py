@@ -27,7 +27,7 @@ def hear_scene(
 
     Args:
         session: any session of the rig.
-        detections: of this session: its captures, and where the board is.
+        detections: detections of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
         thumbnails: receives the images that were decoded.
     """

@@ -59,7 +59,7 @@ def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[
     """List the keys and values that `edit_text` sets for a camera's intrinsics.
 
     Args:
-        camera: its name.
+        camera: the camera's name.
         lens: with the images' size.
         others: further keys of the block `intrinsics`.
     """

@@ -112,7 +112,7 @@ class SyncSettings(Settings):
 
     Attributes:
         type: its protocol: lce-rig's own (docs/sync-protocol.md).
-        device: its serial port.
+        device: serial port of the board.
         baud: speed of the port; None for 115200, any over USB.
         triggers: the trigger lines, by the camera's name.
     """

@@ -17,10 +17,10 @@ def colour_points(
     """Give each point of a scan the colour of its nearest pixel.
 
     Args:
-        scan: of N points; those that are not finite get no colour.
+        scan: scan of N points; those that are not finite get no colour.
         pixels: (H, W) grey or (H, W, 3) BGR, of the camera's resolution.
         T_cam_lidar: (4, 4).
-        lens: of the camera.
+        lens: intrinsics of the camera.
 
     Returns:
         RGB (N, 3), black where the camera does not see the point, and whether it does (N,): in the image,

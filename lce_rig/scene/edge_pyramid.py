@@ -57,8 +57,8 @@ def places(pixels: Array, reduction: int | NDArray[np.intp]) -> NDArray[np.float
     """Return the places (2, N) of an image's pixels (N, 2) in its fields; far outside where NaN.
 
     Args:
-        pixels: of the image.
-        reduction: of the field, or of each pixel's field (N,).
+        pixels: pixels of the image.
+        reduction: reduction factor of the field, or of each pixel's field (N,).
     """
     at = (pixels.T + 0.5) / reduction - 0.5
     return np.asarray(np.fmin(np.fmax(at, _FAR_OUTSIDE), -_FAR_OUTSIDE), dtype=np.float32, order="C")
@@ -95,7 +95,7 @@ def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
 
     Args:
         grey: (H, W) image.
-        focal_px: of its lens.
+        focal_px: focal length of its lens.
     """
     reduction = 1
     while focal_px / reduction > _WORKING_FOCAL_PX:
@@ -110,8 +110,8 @@ def build_event_pyramid(events: Events, focal_px: float) -> EdgePyramid:
     passes, are in it.
 
     Args:
-        events: of a few hundredths of a second.
-        focal_px: of the lens.
+        events: events of a few hundredths of a second.
+        focal_px: focal length of the lens.
     """
     pixels = events.y.astype(np.intp) * events.width_px + events.x
     counts = np.bincount(pixels, minlength=events.width_px * events.height_px).astype(np.float32)

@@ -105,8 +105,8 @@ def estimate_scene(
     whose edges match nowhere, adds a constant: it has no veto.
 
     Args:
-        views: of one drive or room.
-        intrinsics: of the camera.
+        views: images and scans of one drive or room.
+        intrinsics: intrinsics of the camera.
         T_start: (4, 4) rough extrinsics.
         reach: (6,) largest error of each axis of the start, m and rad.
     """
@@ -141,8 +141,8 @@ def find_better_focal(
     Wrong focal lengths move the camera along its line of sight: 2 % by 0.2 m in a street.
 
     Args:
-        views: as of `estimate_scene`.
-        intrinsics: of the camera.
+        views: as in `estimate_scene`.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) the estimate.
 
     Returns:
@@ -272,8 +272,8 @@ def follow_lens(
     rotation, mostly, for a principal point; along the line of sight for focal lengths.
 
     Args:
-        views: as of `estimate_scene`.
-        intrinsics: of the camera.
+        views: as in `estimate_scene`.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) the estimate.
         changes: (P, n) of the parameters of its `model_of`.
     """

@@ -24,8 +24,8 @@ class OutlineView:
     """Edges of one scan and of one image of the same scene.
 
     Attributes:
-        capture: its name.
-        outlines: of the scan, near the image.
+        capture: the capture's name.
+        outlines: outlines of the scan, near the image.
         pyramid: fields of the image's edges.
     """
 
@@ -41,10 +41,10 @@ def build_outline_view(
 
     Args:
         capture: name of the view.
-        image: of the camera, or its events about the scan.
-        scan: of the LiDAR.
-        beam: of the LiDAR.
-        intrinsics: of the camera.
+        image: image of the camera, or its events about the scan.
+        scan: scan of the LiDAR.
+        beam: beam of the LiDAR.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) rough extrinsics, within a few degrees.
     """
     at_camera = transform(T_cam_lidar, scan.points)
@@ -65,7 +65,7 @@ class OutlineScore:
 
     Args:
         views: at least one with an outline.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) that tangents start from.
         level: index of SIGMAS_RAD.
     """

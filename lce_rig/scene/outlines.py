@@ -83,7 +83,7 @@ def find_outlines(points: NDArray[Any], intensity: NDArray[Any], beam: Beam) -> 
     Args:
         points: (N, 3) m, frame lidar.
         intensity: (N,).
-        beam: of this LiDAR.
+        beam: beam of this LiDAR.
     """
     points = np.asarray(points, dtype=np.float64)
     range_m = np.linalg.norm(points, axis=1)

@@ -127,7 +127,7 @@ def clocks_apart_s(
 
     Args:
         views: the captures.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) deployed.
         T_changed: (4, 4) changed extrinsics that explain the images otherwise.
 

@@ -53,7 +53,7 @@ def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
     """Turn a failure to write into one error with the action against it.
 
     Args:
-        path: of the file or folder.
+        path: path of the file or folder.
         n_safe: captures before it, which are safe.
 
     Raises:

@@ -57,8 +57,8 @@ class DifferingKey(NamedTuple):
     """A key in which two profiles differ.
 
     Attributes:
-        path: of the key, such as ("cameras", "davis", "frame").
-        theirs, ours: its values, "absent" where a profile does not have it.
+        path: path of the key, such as ("cameras", "davis", "frame").
+        theirs, ours: values of the key, "absent" if a profile lacks it.
     """
 
     path: tuple[str, ...]

@@ -194,7 +194,7 @@ class Session:
         """Return the session, open for reading, with another profile of the same rig; files do not change.
 
         Args:
-            rig: as of `adopt`.
+            rig: as in `adopt`.
 
         Raises:
             SessionError: the profile is of another rig.
@@ -308,7 +308,7 @@ class Session:
         """Put a capture aside: it is no longer used, and not collected again.
 
         Args:
-            name: of the capture.
+            name: name of the capture.
             reason: kept in the journal.
 
         Raises:
@@ -394,7 +394,7 @@ class Session:
         """Copy the captures of another session of this rig, except those that this one holds or has rejected.
 
         Args:
-            other: of the same board and sensors; limits and targets may differ.
+            other: a profile of the same board and sensors; limits and targets may differ.
 
         Returns:
             The names of the copies.

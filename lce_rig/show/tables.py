@@ -23,8 +23,8 @@ class Table(NamedTuple):
 
     Attributes:
         title: above it.
-        headings: of the columns.
-        rows: of cells.
+        headings: headings of the columns.
+        rows: rows of cells.
         n_texts: the first columns hold text, the others figures.
     """
 

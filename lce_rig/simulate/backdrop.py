@@ -25,7 +25,7 @@ def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster
         lamps: (P, 3) m, facing down.
         points: (N, 3) m.
         normals: (N, 3) unit.
-        occluders: of the lamps.
+        occluders: occluders of the lamps.
 
     Returns:
         (N, 3) linear (blue, green, red).
@@ -63,7 +63,7 @@ class Backdrop:
     """A camera at its pose in the room, with its image of the room.
 
     Attributes:
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_world_cam: (4, 4).
         corner_rays: (H + 1, W + 1, 3) unit rays through the pixels' corners, world.
         radiance: (H, W, 3) linear (blue, green, red).

@@ -137,7 +137,7 @@ def place_board(
         board: the board.
         room: the board and its carrier must stand free in it.
         options: ranges of distance and roll.
-        index: of the capture; consecutive ones fill the image evenly.
+        index: index of the capture; consecutive ones fill the image evenly.
         rng: source of the tilt and of the next candidates.
         start: (3,) start of the session's even filling, 0..1.
 

@@ -39,7 +39,7 @@ class Room:
 
     Attributes:
         T_world_room: (4, 4); world has the LiDAR's heading, z up, origin on the floor below the LiDAR.
-        raycaster: of all surfaces.
+        raycaster: ray caster of all surfaces.
         lamps: (P, 3) m, world.
         low, high: (3,) corners, m, frame room.
         obstacles: (low, high) of objects in it, m, frame room.

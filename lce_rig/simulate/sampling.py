@@ -138,7 +138,7 @@ class SimulatedCapture:
     """One capture with its truth.
 
     Attributes:
-        index: of the capture in its session.
+        index: index of the capture in its session.
         images: one a camera that has a channel of frames, in the profile's order.
         scans: one a LiDAR, in the profile's order.
         T_lidar_board: true (4, 4) by LiDAR, at its scan's timestamp.
@@ -176,7 +176,7 @@ def simulate_captures(
     Args:
         rig: the profile.
         n_captures: how many; the first ones do not depend on this number.
-        seed: of truth, room, placements and noise.
+        seed: random seed of truth, room, placements and noise.
         options: `SimulationOptions.for_rig` of the rig by default.
 
     Raises:
@@ -207,7 +207,7 @@ def capture_at(
 
     Args:
         stage: the session, see `set_stage`.
-        index: of the capture; its noise and its timestamp follow from it.
+        index: index of the capture; its noise and its timestamp follow from it.
         T_world_board: (4, 4).
         rng: source of the carrier's appearance; follows from the index by default.
     """
@@ -340,8 +340,8 @@ def simulate_recording(
 
     Args:
         rig: the profile.
-        duration_s: of the recording.
-        seed: of truth, room, placements and noise.
+        duration_s: duration of the recording.
+        seed: random seed of truth, room, placements and noise.
         options: `SimulationOptions.for_rig` of the rig by default; the board always moves.
 
     Raises:

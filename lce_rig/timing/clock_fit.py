@@ -94,7 +94,7 @@ def match_edges(
         source_ns: (N,) edges on the one clock; rising.
         reference_ns: (M,) edges on the other; rising, more than twice the tolerance apart.
         coarse: from the one clock to the other, right to within the tolerance.
-        tolerance_ns: how far off it may be.
+        tolerance_ns: largest accepted deviation.
 
     Returns:
         The edges (K,) on both clocks that are nearest to each other both ways and within the tolerance.

@@ -67,7 +67,7 @@ class EdgeClock:
         """Begin without a model.
 
         Args:
-            sensor: its name in the profile.
+            sensor: the sensor's name in the profile.
             coarse_error_ns: largest error of the coarse model.
         """
         self.problem: Finding | None = findings.NO_EDGES(sensor)

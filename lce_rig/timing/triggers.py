@@ -66,7 +66,7 @@ class TriggerMatcher:
         """Prepare to find the constant.
 
         Args:
-            camera: its name in the profile.
+            camera: the camera's name in the profile.
             max_delay_ns: latest timestamp of an image after its pulse, on the board's clock.
         """
         self.counts = Counter[str]()

@@ -73,7 +73,7 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
 
     Args:
         observations: one per capture.
-        board: its specification.
+        board: the board's specification.
 
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
@@ -134,7 +134,7 @@ def solve_planes(
     with M ring ends.
 
     Args:
-        features: of each capture.
+        features: fitted features of each capture.
         sigmas_m: typical errors of a capture's plane and of its ring ends.
         keep: per capture a mask of the plane points to use; all by default.
 
@@ -164,7 +164,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     Edges could replace planes, but a set that requires this is fragile, as edge errors are systematic.
 
     Args:
-        features: of the captures in `problem`.
+        features: fitted features of the captures in `problem`.
         problem: their moments.
         T_cam_lidar: (4, 4) estimate.
 
@@ -199,7 +199,7 @@ def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> l
     normal. No capture loses more than half of its points, so that the filter does not reject whole captures.
 
     Args:
-        features: of all captures.
+        features: fitted features of all captures.
         T_cam_lidar: (4, 4) estimate.
 
     Returns:
@@ -219,7 +219,7 @@ def reject_outliers(
     """Refuse captures whose plane or edges are far from the other captures' prediction, worst first.
 
     Args:
-        features: of the captures in `problem`.
+        features: fitted features of the captures in `problem`.
         problem: their moments, weighted alike.
         T_start: (4, 4) planar initialisation.
 

@@ -48,7 +48,7 @@ def estimate_shifts(
 
     Args:
         observations: F captures.
-        features: of each.
+        features: fitted features of each capture.
         T_cam_lidar: (4, 4) near the truth.
     """
     from scipy.special import fdtri

@@ -51,7 +51,7 @@ class Solutions:
         R: (B, 3, 3).
         linear: (B, 4): t, then the edge shift.
         edge_ids: (B, n) edge of each ring end.
-        certificates: of each.
+        certificates: certificate of each solution.
     """
 
     R: Array
@@ -75,7 +75,7 @@ class Problem:
 
     Args:
         features: one per capture.
-        weights: of the terms.
+        weights: weights of the terms.
         keep: per capture a mask of the plane points to use; all by default.
     """
 
@@ -151,7 +151,7 @@ class Problem:
         Args:
             selection: (B, F).
             T_start: (4, 4) T_cam_lidar for the first association.
-            n_rounds: of association and solution.
+            n_rounds: number of rounds of association and solution.
         """
         R = np.repeat(T_start[None, :3, :3], len(selection), axis=0)
         linear = np.tile(np.append(T_start[:3, 3], 0.0), (len(selection), 1))

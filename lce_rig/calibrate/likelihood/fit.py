@@ -105,8 +105,8 @@ class JointEstimate(Optimum):
 
     Attributes:
         terms: linearised there.
-        levels: of the noise.
-        priors: of the constants.
+        levels: noise levels.
+        priors: prior standard deviations of the constant errors.
         placement: (F,) number of the placement that each capture shows; each its own without cameras.
         captures: (F,) their names, sorted.
     """
@@ -190,10 +190,10 @@ def maximise_likelihood(
         cameras: observations of each.
         board: the board.
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
-        priors: of the constant errors.
+        priors: prior standard deviations of the constant errors.
         usual: typical noise levels.
         pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
-        lenses: of each camera, with errors as unknowns, the base last; None for exact lenses.
+        lenses: lenses of each camera, with errors as unknowns, the base last; None for exact lenses.
     """
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
     base = None if len(images) == len(cameras) else len(cameras)
@@ -249,7 +249,7 @@ def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual
     Args:
         lidars: the boards.
         board: the board.
-        priors: of the constant errors.
+        priors: prior standard deviations of the constant errors.
         usual: typical noise levels.
     """
     scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
@@ -363,9 +363,9 @@ def fit_levels(
         terms: linearised near the optimum.
         start: levels to start from.
         usual: centre of their prior; lasers without offsets there have none.
-        priors: of the constants.
-        n_rounds: of the search, at most.
-        names: of the levels to find; others are the usual ones.
+        priors: prior standard deviations of the constant errors.
+        n_rounds: number of rounds of the search, at most.
+        names: names of the levels to find; others are the usual ones.
     """
     from scipy.optimize import minimize
 
@@ -437,7 +437,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
     twice.
 
     Args:
-        cost: of the captures at the optimum, those of a placement with the weight of one.
+        cost: quadratic cost of the captures at the optimum, those of a placement with the weight of one.
         J: (e, G) derivative of the extrinsics.
 
     References:

@@ -44,9 +44,9 @@ class Hypothesis:
     Attributes:
         terms: linearised at the optimum; the images of each mounting are those of a camera. Those of a camera
             that is the base are the last.
-        images: of all mountings.
-        levels: of the noise.
-        priors: of the constants.
+        images: images of all mountings.
+        levels: noise levels.
+        priors: prior standard deviations of the constant errors.
         captures: (F,) names, sorted.
         mounting: (F,) number of each capture's mounting.
         T_lidar_board: (F, 4, 4) poses of the boards by the estimate, or by the scan alone if it has none.
@@ -101,7 +101,7 @@ class Hypothesis:
         """Find the optimum under other assumptions.
 
         Args:
-            priors: of the constants; the present ones by default.
+            priors: prior standard deviations of the constant errors; the present ones by default.
             mounting: (F,) of the captures; the present one by default.
             T_cam_lidar: (M, 4, 4) of each mounting, to start from.
         """
@@ -141,9 +141,9 @@ def at_full_weight(
 
     Args:
         joint: the estimate.
-        observations: of the camera, also of captures that the estimate does not use.
-        lenses: of the camera, and of one that is the base; None if exact.
-        camera: its number.
+        observations: observations of the camera, also of captures that the estimate does not use.
+        lenses: lenses of the camera, and of one that is the base; None if exact.
+        camera: index of the camera.
     """
     board, T_cam_lidar = joint.terms.board, joint.state.T_cam_lidar[camera]
     names, scans, images = stack_captures([observations], board, lenses, None)

@@ -74,7 +74,7 @@ def stack_images(
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them, or poses by the first of two LiDARs, which have no lens.
-        pattern_offset_m: of the pattern's centre from the plate's.
+        pattern_offset_m: standard deviation of the pattern's centre from the plate's.
         lens: whose errors are unknowns; None for a lens that is exact.
     """
     T = np.array([image.T_cam_board for image in images])

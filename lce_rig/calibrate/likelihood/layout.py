@@ -216,7 +216,7 @@ class State:
         Args:
             layout: the other one.
             rings: (L,) ring numbers of this one.
-            other_rings: of the other one.
+            other_rings: rings of the other layout.
         """
         z = np.zeros(layout.z.size)
         _, here, there = np.intersect1d(rings, other_rings, return_indices=True)

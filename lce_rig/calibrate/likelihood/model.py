@@ -43,12 +43,12 @@ class Terms:
 
     Attributes:
         scans: rays of F captures.
-        images: of each camera.
+        images: images of each camera.
         board: the plate's size.
         state: values of the unknowns.
         trust: (F,) weight of each capture.
-        ranges: of points, at the state.
-        edges: of ring ends.
+        ranges: sums of returns, at the state.
+        edges: rows of ring ends.
         image_rows: linearised, of each camera.
     """
 
@@ -187,7 +187,7 @@ class Reduced:
     """Normal equations with the captures' own unknowns eliminated.
 
     Attributes:
-        cost: of F captures in z, at its present value.
+        cost: quadratic cost of F captures in z, at its present value.
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
@@ -244,9 +244,9 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
     """Weight all terms, eliminate the captures' own unknowns and add the priors.
 
     Args:
-        terms: of F captures.
-        levels: of their noise.
-        priors: of the constants.
+        terms: linearised terms of F captures.
+        levels: noise levels of the terms.
+        priors: prior standard deviations of the constant errors.
     """
     return _reduce(terms, sum_products(terms, levels), levels, priors)
 
@@ -260,9 +260,9 @@ class Evidence:
     by differences.
 
     Attributes:
-        terms: of F captures.
-        priors: of the constants.
-        names: of the levels that vary.
+        terms: linearised terms of F captures.
+        priors: prior standard deviations of the constant errors.
+        names: names of the levels that vary.
         others: sum of the products that depend on other levels alone.
     """
 
@@ -346,7 +346,7 @@ def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced
         summed: products of rows of n_own own unknowns, G others and the residual.
         trust: (F,) weight of each capture.
         n_own: number of own unknowns of a capture.
-        known: of the others.
+        known: levels that do not vary.
     """
     M, log_volume = summed
     own, common = slice(0, n_own), slice(n_own, None)

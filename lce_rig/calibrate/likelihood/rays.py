@@ -239,7 +239,7 @@ def correct_points(lidar: LidarBoard, board: Board, rings: NDArray[np.int16], st
 
     Args:
         lidar: the board as measured.
-        board: its size.
+        board: the board's size.
         rings: (L,) ring numbers of the state's lasers, ascending; other rings count as exact.
         state: the estimate.
     """
@@ -263,7 +263,7 @@ def bow_heights(on_board: Array, board: Board) -> Array:
 
     Args:
         on_board: (..., 2 or 3) points, frame board, m.
-        board: its size.
+        board: the board's size.
     """
     half = np.array([board.width_m, board.height_m]) / 2
     return np.asarray(1 / 3 - (on_board[..., :2] / half) ** 2)

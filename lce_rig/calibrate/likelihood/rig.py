@@ -170,7 +170,7 @@ class RigEstimate(Optimum):
 
     Attributes:
         terms: linearised there.
-        levels, priors: of each LiDAR; those of the images are the first one's.
+        levels, priors: noise levels and priors of each LiDAR; those of the images are the first one's.
         placement: (F,) number of the placement that each capture shows.
     """
 
@@ -264,12 +264,12 @@ def maximise_rig(
     """Estimate the poses of M LiDARs and of cameras, from estimates of pairs of them.
 
     Args:
-        scans: of each LiDAR, of F captures; the first is the base.
-        images: of each camera, of the same captures.
+        scans: scans of each LiDAR, of F captures; the first is the base.
+        images: images of each camera, of the same captures.
         board: the board.
-        states: of each LiDAR, to start from; the first one's with the cameras' extrinsics.
+        states: states of each LiDAR, to start from; the first one's with the cameras' extrinsics.
         T_lidar_base: (M, 4, 4) to start from.
-        levels, priors: of each LiDAR; the noise is not estimated anew.
+        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated anew.
         placement: (F,) number of the placement that each capture shows.
     """
     once = weigh_placements(placement, images)

@@ -114,7 +114,7 @@ def sample_poses(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[
 
     Args:
         scans: with their images; the first image's corners give the orientation of the others.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
         noise_px: corner noise by channel, replacing each image's own.
     """
     channels = tuple(sorted({channel for scan in scans for channel in scan.images}))
@@ -150,7 +150,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     """Fit equation (1) to each capture, with the typical rates of maximum likelihood.
 
     Args:
-        samples: of F captures.
+        samples: samples of F captures.
         offset_s: (C,) added to the images' times, by channel.
         only: a channel that alone gives the board's position; the others then only give its motion.
 
@@ -255,10 +255,10 @@ def compensate(
     """Bring both sensors' boards to the LiDAR's time, and the points of each board to one time.
 
     Args:
-        observations: of F captures.
-        motions: of the board in them.
+        observations: observations of F captures.
+        motions: motions of the board in them.
         T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
-        sweep_s: of the LiDAR.
+        sweep_s: duration of a revolution of the LiDAR.
     """
     times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
     moved = [

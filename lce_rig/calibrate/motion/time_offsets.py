@@ -103,9 +103,9 @@ def estimate_motion(
     Args:
         scans: F of them with their images.
         samples: poses of the board in these.
-        board: its size.
+        board: the board's size.
         start: extrinsics and weights without compensation.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
     """
     still = Motion(scans, samples, start.T_cam_lidar, clocks.sweep_s)
     moving = np.flatnonzero(samples.tells_motion).tolist()

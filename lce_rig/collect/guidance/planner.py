@@ -32,10 +32,10 @@ class Coverage:
     """Five bars, each 0..1.
 
     Attributes:
-        left_right, up_down: how far apart in the image boards were.
-        near_far: how much farther the farthest was than the nearest.
+        left_right, up_down: spread of the boards' positions in the image.
+        near_far: ratio of the largest to the smallest distance.
         tilt: a quarter for each of top, bottom, left and right that was towards the rig by `LEANS_DEG`.
-        roll: how differently boards were turned in their plane.
+        roll: range of the boards' rotations in their plane.
     """
 
     left_right: float
@@ -129,7 +129,7 @@ class Beside(NamedTuple):
     """Another pair of sensors that may detect the same board.
 
     Attributes:
-        planner: of it.
+        planner: planner of this pair.
         T_other_cam: (4, 4) from the camera's frame to that of its camera.
         held: (N, 4, 4) T_cam_board of its captures, frame of its camera.
     """
@@ -270,7 +270,7 @@ class Planner:
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
             present: (4, 4) T_cam_board now.
-            names: of the captures held; numbers from 1 by default.
+            names: names of the captures so far; numbers from 1 by default.
             avoid: (M, 4, 4) as `guide` takes them: no board is refused for a better place out of reach.
             asked: (4, 4) placement given to the user; a board there is refused only if captured before.
 
@@ -429,7 +429,7 @@ def common_third(lens: Intrinsics, centres: Array) -> str:
     """Name the outer third of the image that contains all boards; "" for none.
 
     Args:
-        lens: of the camera.
+        lens: intrinsics of the camera.
         centres: (N, 3) of the boards, camera frame, m.
     """
     pixels, _ = lens.project(centres)

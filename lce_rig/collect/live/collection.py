@@ -58,8 +58,8 @@ def collect_live(
 
     Args:
         session: open for writing; its captures count.
-        sources: of every sensor, and of the sync board if there is one; not open yet.
-        options: of the collection.
+        sources: live sources of every sensor, and of the sync board if there is one; not open yet.
+        options: options of the collection.
         show: receives the state after every frame, and twice a second without one; must not block.
         keys: returns the user's last key or request, if any.
         record_to: a new folder for the raw streams; None to record none.

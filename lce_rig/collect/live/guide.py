@@ -160,7 +160,7 @@ class Guide:
 
         Args:
             T_cam_lidar: (4, 4).
-            levels: of the noise, as estimated.
+            levels: noise levels, as estimated.
             inflation: factor by which the scatter of the captures widened the covariance.
         """
         if self._model is None:

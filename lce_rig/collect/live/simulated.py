@@ -91,7 +91,7 @@ class SimulatedRig:
     """A simulated rig and a person with the board in front of it; open while its `with` block lasts.
 
     Attributes:
-        sources: of its sensors: frames and scans. Events cannot be simulated in real time.
+        sources: live sources of its sensors: frames and scans. Events cannot be simulated in real time.
     """
 
     def __init__(self, rig: Rig, seed: int) -> None:
@@ -99,7 +99,7 @@ class SimulatedRig:
 
         Args:
             rig: the profile.
-            seed: of truth, room, noise and the person.
+            seed: random seed of truth, room, noise and the person.
 
         Raises:
             ProfileError: no camera of the rig has frames, or its LiDAR is not known.

@@ -24,7 +24,7 @@ class TakeBack:
     """A request to reject the last capture of this run.
 
     Attributes:
-        name: of the capture shown to the user: another one stays; "" for the last one.
+        name: name of the capture shown to the user: another one stays; "" for the last one.
     """
 
     name: str = ""
@@ -126,7 +126,7 @@ class Cue(NamedTuple):
 
     Attributes:
         number: rises with every cue, so that a view plays each once.
-        sound: which.
+        sound: name of the sound.
     """
 
     number: int
@@ -161,7 +161,7 @@ class LiveState(NamedTuple):
     Attributes:
         rig, session: the profile's name and the session's folder.
         elapsed_s: time since the start of the collection.
-        phase: of the collection.
+        phase: phase of the collection.
         headline: the one thing to do, large: "one step left, 0.5 m closer".
         detail: reason or progress, smaller; "" without either.
         hold_s: time that the board must still be held; None unless it is being held.
@@ -171,7 +171,7 @@ class LiveState(NamedTuple):
         last_capture: name of the capture that would be taken back; "" without one.
         streams: every stream.
         drawing: the guiding camera's image; None before the first.
-        coverage: of the reachable placements by the captures; None without guidance.
+        coverage: coverage of the reachable placements by the captures; None without guidance.
         sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN with few captures.
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.

@@ -53,7 +53,7 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
 
     Args:
         events: about the image.
-        stamp_ns: of the image.
+        stamp_ns: timestamp of the image.
         around_px: (M, 2) the board's outline in it.
     """
     outline = around_px[np.isfinite(around_px).all(axis=1)]
@@ -77,7 +77,7 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
 
     Args:
         lidar: the board in one scan; without firing times, its span in azimuth is used.
-        period_s: of one revolution.
+        period_s: duration of one revolution.
     """
     if lidar.offset_ns is not None and len(lidar.offset_ns):
         return float(np.ptp(lidar.offset_ns)) * 1e-9
@@ -96,7 +96,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
     Args:
         measured: figures of the board's events.
         found: with its track.
-        sweep_s: how long the LiDAR sees the board; None if it does not.
+        sweep_s: duration of the LiDAR's returns from the board; None without any.
     """
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
     if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
@@ -188,7 +188,7 @@ def explain_missing_board(
 
     Args:
         events: about the image.
-        stamp_ns: of the image.
+        stamp_ns: timestamp of the image.
         seen: the refusal, because the image is missing or has no board in it.
         limits: `quality` of the rig profile.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.

@@ -72,9 +72,9 @@ def find_event_board(
         stamp_ns: on the events' clock.
         reconstructor: is reset.
         board: the board as the profile describes it.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         limits: `quality` of the rig profile.
-        sweep_s: how long the LiDAR sees the board; None if it does not.
+        sweep_s: duration of the LiDAR's returns from the board; None without any.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
 
     Returns:

@@ -180,7 +180,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
     Args:
         grey: (H, W).
         size: (cols, rows); either may be the rows.
-        scale: of the image that is searched.
+        scale: scale of the image that is searched.
 
     Returns:
         (rows * cols, 2) px, row by row, to about half a pixel; None if no such grid is found.

@@ -64,7 +64,7 @@ def find_marked_grid(
     Args:
         grey: (H, W).
         board: one that has markers.
-        intrinsics: of the camera; rough ones are sufficient.
+        intrinsics: intrinsics of the camera; rough ones are sufficient.
         is_thorough: whether to search at further scales, and for markers of other dictionaries.
 
     Returns:

@@ -67,7 +67,7 @@ def find_image_board(
     Args:
         image: the image.
         board: the board as the profile describes it.
-        intrinsics: of the camera, at the image's resolution.
+        intrinsics: intrinsics of the camera, at the image's resolution.
         last: the board in the previous image: if it is within a third of a square of its place there, the
             search is skipped; else its surroundings are searched first.
         limits: `quality` of the rig profile.

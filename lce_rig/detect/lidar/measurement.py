@@ -112,7 +112,7 @@ def measure_size(
     Args:
         ends: ring ends.
         uv: (M, 2) of the plane view, m.
-        placement: of the rectangle with the nominal size.
+        placement: placement of the rectangle with the nominal size.
         beyond_m: how far the light spot reaches over an edge.
 
     Returns:
@@ -173,7 +173,7 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
     Args:
         ends: ring ends.
         side: (E,) nearest side of the fitted rectangle.
-        residual_m, step_m: of them, by `measure_size`.
+        residual_m, step_m: residual and step of the ring ends, by `measure_size`.
     """
     smear_m = np.zeros(len(side))
     is_telling = ends.is_border & (step_m > _CROSSING * np.linalg.norm(ends.gap, axis=1))
@@ -233,7 +233,7 @@ def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple
     Args:
         points: (N, 3) m, frame lidar.
         start: (4,) plane as (n, d).
-        distance_m: of the plate's middle.
+        distance_m: distance of the plate's middle.
 
     Returns:
         (4,) plane as (n, d), n towards the LiDAR, and a robust standard deviation of the returns from it, m.
@@ -317,7 +317,7 @@ def build_board(
         source: the scan they come from.
         board: nominal size.
         view: beams about the board.
-        placement: of the nominal rectangle.
+        placement: placement of the nominal rectangle.
         beam: light spot of the LiDAR.
 
     Returns:

@@ -194,7 +194,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
     Args:
         rays: about the plate.
         outline: fitted to them.
-        blur_m: as of `fit_outline`.
+        blur_m: as in `fit_outline`.
 
     Returns:
         (4,) of the right, left, top and bottom side.
@@ -254,7 +254,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
     Args:
         rays: about the plate.
         outline: fitted to them.
-        blur_m: as of `fit_outline`.
+        blur_m: as in `fit_outline`.
         smears_m: (4,) of the sides' borders, beyond that blur.
     """
     from scipy.special import ndtr

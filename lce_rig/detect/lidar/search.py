@@ -128,7 +128,7 @@ def nearest_plate(plates: Plates, misfit: Array, board: Board, limits: Limits) -
         plates: K of them.
         misfit: (K,) sum of |log| of the ratios of long and short side.
         board: the board searched for.
-        limits: of the search.
+        limits: limits of the search.
     """
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
@@ -268,7 +268,7 @@ def _past_dark_squares(
 
     Args:
         scan: all returns.
-        board, start, limits, max_beyond: as of `measure_plate`.
+        board, start, limits, max_beyond: as in `measure_plate`.
 
     Returns:
         As `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.

@@ -70,7 +70,7 @@ class Placement:
 
     Attributes:
         u_m, v_m: its centre.
-        angle_rad: of its width axis from u.
+        angle_rad: angle of its width axis from u.
         half_m: half width and half height.
         error_m: how far the beams contradict it: mean capped distance of the chords' ends from the border,
             plus the cap for each beam that contradicts it elsewhere, per chord end or beam on the plane.
@@ -126,7 +126,7 @@ def view_plane(
         among: (K,) of them that are tried.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
-        radius_m: of the disc examined.
+        radius_m: radius of the disc examined.
         tolerance_m, dark_m: as in the view.
     """
     normal, d = plane[:3], plane[3]

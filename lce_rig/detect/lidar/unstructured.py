@@ -460,7 +460,7 @@ def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | N
     Points come in order of time: the outline is fitted to the rays of each quarter.
 
     Args:
-        view: of the plate.
+        view: the plate's plane and beams.
         outline: fitted to all rays.
         smears_m: (4,) of its sides.
     """

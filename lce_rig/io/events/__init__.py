@@ -40,7 +40,7 @@ def open_events(
         path: an AEDAT4, Prophesee .raw or HDF5 file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
-        topic: of a bag; None takes the only one with events.
+        topic: topic of a bag; None takes the only one with events.
 
     Raises:
         SourceError: nothing is there, nothing that can be read, no events, or those of a camera of another

@@ -103,7 +103,7 @@ class EventRecording:
 
         Args:
             path: the file or folder, for messages.
-            stream: its reader.
+            stream: the stream's reader.
             sensor: name of the camera.
             resolution_px: (width, height) of the profile; None takes the file's.
 

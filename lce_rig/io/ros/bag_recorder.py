@@ -49,7 +49,7 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
 
     Args:
         image: the image; one without a timestamp gets 0, which readers take for none.
-        frame_id: of the header.
+        frame_id: frame of the header.
         is_ros1: whether for ROS 1.
     """
     height_px, width_px = image.pixels.shape[:2]

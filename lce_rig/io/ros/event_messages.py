@@ -34,7 +34,7 @@ class EventPacket(NamedTuple):
     """One event_camera_msgs/EventPacket, undecoded.
 
     Attributes:
-        number: of the message, as the driver counted them.
+        number: sequence number of the message, as counted by the driver.
         time_base_ns: origin of the timestamps inside; 0 if they count from the sensor's start.
         encoding: one of `ENCODINGS`.
         words: (N,) uint16, the payload.

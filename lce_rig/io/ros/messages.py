@@ -240,8 +240,8 @@ class EventHead(NamedTuple):
     """The first fields of both kinds of event message.
 
     Attributes:
-        stamp_ns: of the header.
-        frame_id: of the header.
+        stamp_ns: timestamp of the header.
+        frame_id: frame of the header.
         width_px, height_px: resolution of the sensor.
     """
 
@@ -314,7 +314,7 @@ def encode_event_array(events: Events, frame_id: str, encoding: str) -> bytes:
 
     Args:
         events: at least one.
-        frame_id: of the header.
+        frame_id: frame of the header.
         encoding: "ros1" or "cdr".
     """
     raw = np.zeros(len(events), _ROS1_EVENT if encoding == "ros1" else _CDR_EVENT)

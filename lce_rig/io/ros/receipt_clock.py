@@ -42,7 +42,7 @@ def find_foreign(bag: BagFile, topics: Collection[str], *, has_host: bool) -> li
 
     Args:
         bag: whose messages all have headers.
-        topics: of images and scans.
+        topics: topics of images and scans.
         has_host: whether other streams of the rig are on the recorder's clock.
     """
     stamps, receipts = _read_times(bag, topics, _N_PROBED, _N_OF_TOPIC)
@@ -57,7 +57,7 @@ def fit_to_receipts(bag: BagFile, topic: str, *, is_sent_after: bool) -> ClockMo
 
     Args:
         bag: that holds it.
-        topic: of images or scans.
+        topic: topic of images or scans.
         is_sent_after: whether messages are sent a period after the moment that their timestamp marks: scans
             marked by their first firing.
 

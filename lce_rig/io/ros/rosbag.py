@@ -184,7 +184,7 @@ class BagRecording:
         notes: the topics of each sensor, and after reading the losses.
         key: fingerprint of the bag.
         n_samples: number of messages with images and scans on these topics.
-        streams: of the sensors.
+        streams: streams of the sensors.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:

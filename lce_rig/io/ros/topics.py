@@ -182,7 +182,7 @@ class SensorTopic:
         frame: frame_id of the first message's header, or "".
         size_px: (width, height) of images and event arrays; None if not stated.
         n_rings: number of rings of a scan; None for points without a ring.
-        intrinsics: of its images, from its camera_info topic; None if missing or unusable.
+        intrinsics: intrinsics of its images, from its camera_info topic; None if missing or unusable.
         note: the reason why the intrinsics are unusable, or the changes made to fit them to the images.
         cloud: the first point cloud of a topic of scans; None for packets.
     """

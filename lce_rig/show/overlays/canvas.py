@@ -22,7 +22,7 @@ class Thumbnail(NamedTuple):
 
     Attributes:
         pixels: (h, w) grey or (h, w, 3) BGR.
-        width_px: of the image.
+        width_px: width of the image.
     """
 
     pixels: Picture

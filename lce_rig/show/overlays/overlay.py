@@ -101,9 +101,9 @@ def draw_edges(
     """Draw a scan's edges into the image under several extrinsics, side by side; wide images are stacked.
 
     Args:
-        image: of the capture.
-        edges: of its scan.
-        intrinsics: of the camera.
+        image: image of the capture.
+        edges: edges of its scan.
+        intrinsics: intrinsics of the camera.
         poses: T_cam_lidar (4, 4) by name.
         title: one line.
 
@@ -212,8 +212,8 @@ def draw_check(
 
     Args:
         session: the source of the captures.
-        detections: of the session.
-        check: of one channel on these captures.
+        detections: detections of the session.
+        check: result for one channel on these captures.
         folder: receives `<capture>.png` and the page.
         image_of: returns the channel's image in a capture; None if it cannot be read.
         scan_of: returns the cloud to draw in a capture.
@@ -325,7 +325,7 @@ def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
     """Return a check as a camera at the first LiDAR, which looks at the boards, would see it.
 
     Args:
-        check: of two LiDARs.
+        check: result for two LiDARs.
 
     Returns:
         The same as of that camera, and T_camera_first (4, 4).
@@ -346,7 +346,7 @@ def draw_cloud(scan: Scan, T_view: Array) -> Image:
     """Draw the first LiDAR's cloud in grey, as the camera in its place would see it.
 
     Args:
-        scan: of the first LiDAR.
+        scan: scan of the first LiDAR.
         T_view: (4, 4) from its frame to the camera's.
     """
     points = transform(T_view, scan.points[np.isfinite(scan.points).all(axis=1)])

@@ -31,7 +31,7 @@ class CaptureIn3D:
     """The points of one capture, frame lidar.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         points: (N, 3) m.
         colours: (N, 3) RGB.
         is_seen: (N,) whether a camera gave the colour.

@@ -28,7 +28,7 @@ class Evidence:
     """The LiDAR's points on all boards, and the corners in all images.
 
     Attributes:
-        observations: of the C captures used, by name.
+        observations: observations of the C captures used, by name.
         capture: (N,) index of each point's capture.
         plane_m: (N,) signed distance from the camera's board plane, positive behind it.
         ring: (N,) of each point.

@@ -52,7 +52,7 @@ def report_page(
         session: whose result it is.
         file: the result.
         overlays: the folder of overlays beside the report, which shows them once they are drawn.
-        thumbnails: of the session, if some are known; the page is the same without.
+        thumbnails: thumbnails of the session, if some are known; the page is the same without.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
     origin, folder = file.provenance, session.path.resolve().name
@@ -251,8 +251,8 @@ def picture_of(
     Args:
         capture: with the data.
         c: the result; its channels are tried in their order.
-        board: of the outline.
-        lens: of the camera.
+        board: board of the outline.
+        lens: intrinsics of the camera.
         thumbnails: images that need no decoding.
 
     Returns:
@@ -281,7 +281,7 @@ def data_uri(thumbnail: Thumbnail, outline: Array) -> str:
     """Draw an outline into a reduced image.
 
     Args:
-        thumbnail: of the image; it stays as it is.
+        thumbnail: thumbnail of the image, shown unchanged.
         outline: (N, 2) px of the image; points that are not finite are left out.
 
     Returns:

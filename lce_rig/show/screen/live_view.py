@@ -105,7 +105,7 @@ def open_view(
     Args:
         is_plain: print plain lines in any case.
         has_keys: whether keys can be pressed.
-        links: of the page, the likeliest first; a screen covers the links printed earlier.
+        links: links of the page, the likeliest first; a screen covers the links printed earlier.
         wants_code: asked whether to show the page's QR code in place of the guidance.
     """
     bell = Bell(is_silent=not sys.stderr.isatty())
