@@ -52,7 +52,7 @@ def test_lost_images_are_counted_by_sequence_number():
     assert line is not None and line.severity == "note"
 
 
-def test_the_boards_lines_are_held_against_the_profile():
+def test_sync_board_lines_are_compared_with_profile():
     line = look(check_pulses_sent, examination(sync_board()))
     assert line is not None and line.severity == "note"
     assert codes(line) == ["pulses.line_off", "pulses.line"]

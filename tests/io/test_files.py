@@ -61,7 +61,7 @@ def test_deep_pictures_keep_their_contrast(tmp_path, smooth):
 
 
 @pytest.mark.parametrize("name", ["gone.png", "text.png", "gone.pcd", "folder.ply"])
-def test_missing_and_foreign_files_are_named(tmp_path, name):
+def test_missing_and_unreadable_files_are_named(tmp_path, name):
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(SourceError, match=name):

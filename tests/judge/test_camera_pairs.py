@@ -50,7 +50,7 @@ def test_images_pose_error_fits_covariance(sound):
 
 
 @pytest.mark.long
-def test_sound_sessions_are_not_questioned(sound):
+def test_consistent_sessions_have_no_findings(sound):
     for session in sound:
         pair = related(session)
         assert len(pair.captures) == 12
@@ -97,7 +97,7 @@ def test_scaled_lens_scatters_the_boards(sound):
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
 
 
-def test_a_board_seen_wrongly_hardly_matters(sound):
+def test_camera_pair_outlier_board_hardly_matters(sound):
     session = observed(sound[1])
     left, right = session[3]
     wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
@@ -107,7 +107,7 @@ def test_a_board_seen_wrongly_hardly_matters(sound):
     assert np.linalg.norm(error[:3]) < 0.003
 
 
-def test_few_boards_tell_nothing_and_none_no_pair(sound):
+def test_camera_pair_of_few_boards_is_not_judged(sound):
     session = sound[2]
     assert pose_from_images(observed(session)[:3]) is None
     left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)

@@ -113,7 +113,7 @@ def test_explain_drift_is_named():
     ("angle_deg", "first"),
     [(0.8, 8), pytest.param(3.0, 13, marks=pytest.mark.long), pytest.param(5.0, 2, marks=pytest.mark.long)],
 )
-def test_explain_moved_tells_size_and_capture(angle_deg, first):
+def test_explain_moved_reports_size_and_capture(angle_deg, first):
     found, *_ = explained(
         moved(observed(16, 4), lambda k: k >= first, [0, 0, 0, np.radians(angle_deg), 0, 0])
     )
@@ -121,7 +121,7 @@ def test_explain_moved_tells_size_and_capture(angle_deg, first):
     assert tangent_sizes(found.change)[0] == pytest.approx(angle_deg, abs=0.1 if 4 < first < 12 else 0.4)
 
 
-def test_explain_range_offset_tells_size():
+def test_explain_range_offset_reports_size():
     found, *_ = explained(longer(offset_m=0.06)(observed(16, 5)))
     assert found.after.state.lasers[0].mean() == pytest.approx(0.06, abs=0.012)
 

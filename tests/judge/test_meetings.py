@@ -54,7 +54,7 @@ def planes_m(observations: list[Observation]) -> Array:
 
 
 @pytest.mark.parametrize("channel", ["frames", "events"])
-def test_planes_meet_once_the_motion_is_taken_off(
+def test_planes_meet_after_motion_compensation(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
     meetings = bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS)

@@ -29,7 +29,7 @@ def sessions(n, seed, factor=1.0, cov=COV):
     return {f"day{k}": calibration(perturb(TRUTH, root @ rng.standard_normal(6)), cov) for k in range(n)}
 
 
-def test_sound_calibrations_spread_as_their_covariance_says():
+def test_repeat_spread_matches_covariance():
     compared = [compare_calibrations(sessions(3, seed)) for seed in range(100)]
     chi2 = np.array([one.chi2 for one in compared])
     assert all(one.dof == 12 for one in compared)
@@ -56,7 +56,7 @@ def test_repeat_lens_turn_is_no_difference():
     assert same_lens.max_rotation_deg == pytest.approx(np.degrees(np.linalg.norm(turn)), rel=1e-6)
 
 
-def test_uncertainties_that_are_too_small_are_found_out():
+def test_repeat_detects_optimistic_uncertainty():
     compared = compare_calibrations(sessions(4, 2, factor=4.0))
     assert not compared.agrees
     assert compared.ratio == pytest.approx(4, rel=0.4)

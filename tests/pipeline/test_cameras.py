@@ -55,7 +55,7 @@ def by_paper(session):
     return calibrated(detections(session), PAPER)
 
 
-def test_shared_boards_join_the_estimates(together):
+def test_cameras_with_shared_boards_are_estimated_jointly(together):
     for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
         own = together[name]
         assert own.verdict == "pass"
@@ -109,7 +109,7 @@ def test_cameras_without_a_common_board_share_the_lidar(session):
         assert own.other_cameras == ()
 
 
-def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
+def test_failed_cameras_each_have_a_reason(session):
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
     assert "left.frames" in caught.value.what and "3 of 12" in caught.value.what

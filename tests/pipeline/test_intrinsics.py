@@ -82,7 +82,7 @@ def test_wrong_intrinsics_lead_to_the_same_lens_and_fail(pictures, tmp_path):
     assert measured.check.verdict() == "fail"
 
 
-def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
+def test_profile_of_other_resolution_is_accepted(pictures, tmp_path):
     text = set_value(RLES, "cameras.davis.resolution_px", "[692, 520]")
     double = {"fx_px": "699.1", "fy_px": "698.4", "cx_px": "345.5", "cy_px": "253.0"}
     for key, value in double.items():
@@ -100,7 +100,7 @@ def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
     assert camera.to_intrinsics() == measured.intrinsics
 
 
-def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
+def test_channels_share_lens_and_bad_images_are_named(pictures, tmp_path):
     session = session_of(tmp_path / "session", pictures[:4])
     with Session.open(session.path, writable=True) as writer:
         for pixels in [*pictures[4:], np.full((260, 346), 90, dtype=np.uint8)]:

@@ -58,7 +58,7 @@ def test_derive_wrong_profile_names_the_key():
         ("quality.x.y", "1 # b"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_usage_errors(path, value):
+def test_implausible_settings_are_usage_errors(path, value):
     with pytest.raises(UsageError):
         set_value(RLES, path, value)
 

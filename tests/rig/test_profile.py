@@ -159,7 +159,7 @@ def test_nominal_rotation_notations_agree(phi):
         "tolerance_deg: 5.0",
     ],
 )
-def test_what_is_no_rotation_is_refused(rotation):
+def test_invalid_rotation_is_refused(rotation):
     text = RLFS.replace("    tolerance_deg: 5.0\n", "")
     text = text.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", rotation)
     with pytest.raises(ProfileError):

@@ -75,7 +75,7 @@ def judge_corrupted(rig, captures, deployed, corrupt):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CORRUPTIONS)
-def test_a_corruption_is_never_an_all_clear(seen, name):
+def test_corrupted_input_never_passes_drift(seen, name):
     pair = judge_corrupted(seen.rig, seen.captures, seen.truth, CORRUPTIONS[name])
     assert pair.state != "unchanged"
     assert pair.findings[0].code.startswith("scene.") and pair.findings[0].severity != "note"

@@ -93,7 +93,7 @@ def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path, rig, samples
     session.captures[1].check()
 
 
-def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path, rig, samples):
+def test_missing_sample_error_lists_present_ones(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})
     with pytest.raises(SessionError, match=r"cam\.frames"):

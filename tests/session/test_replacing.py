@@ -64,7 +64,7 @@ def test_replace_in_linked_session_only(tmp_path):
     assert contents(tmp_path / "real" / "may") == {"two"}
 
 
-def test_whoever_is_killed_leaves_one_whole_folder(tmp_path):
+def test_killed_replacement_leaves_one_complete_folder(tmp_path):
     fill(tmp_path, "first")
     for k in range(2):  # scripts/fuzz.py result-kills does it by the hundred
         process = subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stdout=subprocess.PIPE)

@@ -121,7 +121,7 @@ def test_rig_clock_jumped_images_keep_time():
     assert came[-1].count == 19 and came[-1].stamp_ns == came[-1].host_ns
 
 
-def test_a_pulse_that_the_camera_missed_is_found_and_told():
+def test_rig_clock_missed_pulse_is_reported():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
     number = 100
@@ -149,7 +149,7 @@ def test_rig_clock_fast_lines_start_slowly():
     assert not clock.needs_slow_triggers
 
 
-def test_a_davis_is_tied_by_the_edges_it_saw():
+def test_rig_clock_davis_is_synchronised_by_edges():
     rig = synced("rles", "davis")
     clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)

@@ -77,7 +77,7 @@ def test_join_camera_pair_beats_lidar_pairs(runs):
         assert np.trace(cov[3:, 3:]) < np.trace(alone[3:, 3:])
 
 
-def test_pairs_of_the_rig_are_those_of_the_estimates(runs):
+def test_rig_pairs_match_estimates(runs):
     for _, together in runs:
         for name in (LEFT, RIGHT):
             T, cov = together.between(name, "lidar")
@@ -88,7 +88,7 @@ def test_pairs_of_the_rig_are_those_of_the_estimates(runs):
             assert np.allclose(cov - of_profile, estimate.cov / inflation, rtol=1e-5, atol=1e-12)
 
 
-def test_the_order_of_cameras_does_not_matter(runs):
+def test_rig_estimate_ignores_camera_order(runs):
     own, together = runs[0]
     turned = join(dict(reversed(own.items())))
     assert turned.cameras == together.cameras
@@ -113,7 +113,7 @@ def test_join_differing_scan_is_refused(runs):
 
 
 @pytest.mark.slow
-def test_errors_and_claims_of_dozens_of_sessions_are_true():
+def test_rig_covariances_fit_errors_of_many_sessions():
     """40 sessions of 20 captures: the right camera in all of them, or in 6."""
     for few, sessions in (
         (20, [simulate_two(20, seed) for seed in range(20)]),

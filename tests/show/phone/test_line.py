@@ -10,7 +10,7 @@ from .screen import OPEN, has_text, shown
 pytestmark = pytest.mark.realtime
 
 
-def test_it_says_that_the_line_is_lost_and_finds_back(browser):
+def test_page_reports_lost_connection_and_reconnects(browser):
     first = Preview(port=0, token="one-token")
     page = browser.open(first.start())
     port = port_of(first)
@@ -33,7 +33,7 @@ def test_it_says_that_the_line_is_lost_and_finds_back(browser):
 
 
 @pytest.mark.long
-def test_a_line_that_falls_silent_is_opened_anew(preview, browser):
+def test_page_reconnects_silent_connection(preview, browser):
     counting = """
       const Plain = WebSocket;
       window.lines = [];
@@ -64,7 +64,7 @@ def test_page_shows_no_news_and_the_end(browser):
 
 
 @pytest.mark.long
-def test_an_old_link_is_said_to_be_old(browser):
+def test_page_reports_outdated_link(browser):
     first = Preview(port=0, token="first-token")
     page = browser.open(first.start())
     shown(first, page, has_text("count", "7"))

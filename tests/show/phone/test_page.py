@@ -25,7 +25,7 @@ _ON_SCREEN = """(() => {
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_state_is_on_the_screen_whole(preview, browser, width, height):
+def test_page_shows_complete_state(preview, browser, width, height):
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, has_text("headline", "one step left, 0.5 m closer"))
     assert page.text("phase") == "move"
@@ -128,7 +128,7 @@ def test_the_countdown_runs_while_the_board_is_held(preview, browser):
     assert page.evaluate("document.body.dataset.phase") == "saving"
 
 
-def test_what_sensors_say_is_text_and_not_markup(preview, browser):
+def test_sensor_messages_are_escaped(preview, browser):
     page = browser.open(preview.urls[0])
     evil = "<img src=x onerror=alert(1)><b>bold</b>"
     stream = StreamState(evil, reason=evil, figures=evil)
