@@ -37,7 +37,7 @@ def test_the_lidars_range_errors_come_from_the_profile():
 
 
 @pytest.mark.parametrize("method", get_args(Method))
-def test_exact_profile_needs_no_tolerances(method):
+def test_exact_profile_adds_no_covariance(method):
     text = RLFS
     for key in ("square_sigma_m", "pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m"):
         text = set_value(text, f"board.{key}", "0.0")
