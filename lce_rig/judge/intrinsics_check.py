@@ -227,7 +227,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
     }
     severity, action = failing(check.verdict(target_deg) == "fail"), ""
     if check.surprise is not None:
-        # The result has the fitted intrinsics; only a lens that is hardly the profile's is a doubt.
+        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is reported.
         severity = "warning" if check.surprise > _OTHER_LENS else "note"
         action = "" if severity == "warning" else "weighed"
     elif judgement.code == "intrinsics.undetermined":
@@ -236,7 +236,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
-    """Try moving rows, and other lens models where corners do not fit as well as their noise allows.
+    """Test for moving rows, and for other lens models if corners fit worse than their noise allows.
 
     Args:
         fitted: intrinsics of the profile's model.
@@ -261,7 +261,7 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
             start = fitted.intrinsics
             reached[name] = estimate_intrinsics(fitted.views, board, start, model, n_folds=0).rms_px
     own, least_px = fitted.model.name, min(reached.values(), default=np.inf)
-    # Of models that are about as near the one with the fewest parameters.
+    # Among models that fit about equally well, choose the one with the fewest parameters.
     near = [name for name, px in reached.items() if px < _ALIKE * least_px]
     best = min(near, key=lambda name: MODELS[name].size, default="")
     if _NEARER * least_px > fitted.rms_px:

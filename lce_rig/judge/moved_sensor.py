@@ -1,4 +1,4 @@
-"""Which sensor of a rig moved during the session, by the captures of all pairs together.
+"""Find the sensor of a rig that moved during the session, from the captures of all pairs together.
 
 A sensor that moved changes the extrinsics of all its pairs by one motion, and those of no other pair. With h
 and S of `explanations` (2) for pair p, and A_p the derivative of its extrinsics by the sensor's motion s, the
@@ -92,7 +92,7 @@ class MovedSensor:
         return self.name in pair.sensors and min(pair.used) < self.first_after
 
     def finding(self, pair: PairCosts) -> Finding:
-        """Report the motion for a pair of this sensor: a note if its result is of the mounting since."""
+        """Report the motion for a pair of this sensor: a note if its result uses only captures after it."""
         held = pair.used if pair.hypothesis is None else pair.hypothesis.captures
         before = tuple(name for name in held if name < self.first_after)
         after = tuple(name for name in held if name >= self.first_after)

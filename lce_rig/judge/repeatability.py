@@ -24,7 +24,7 @@ from lce_rig.judge.reach import JointDifference, covariance_alone, equivalent_ex
 _CHANCE = 0.01
 # If correct ones spread farther with more than this probability, reported uncertainties are conservative.
 _GENEROUS = 0.95
-# Distance of boards that is assumed where results do not state it, m.
+# Assumed distance of boards in results that do not state it, m.
 _LEVER_M = 2.0
 
 
@@ -132,7 +132,7 @@ class Repeatability:
 def compare_calibrations(
     calibrations: Mapping[str, Calibration], *, are_independent: bool = True
 ) -> Repeatability:
-    """Compare calibrations of the same camera and LiDAR, each with its own lens, as they draw points.
+    """Compare calibrations of the same camera and LiDAR by projected points, each with its own lens.
 
     Results of the same captures share errors to an unknown extent. For any correlation, the covariance of
     a - b is at most 2 (cov_a + cov_b), because that of a + b is not negative: this bound is used for them.
@@ -179,7 +179,7 @@ def compare_calibrations(
         p = min(1.0, len(pairs) * chance_of(chi2, dof))
     blamed = []
     if are_independent and p < _CHANCE and len(names) > 2:
-        # Sessions without which the others agree.
+        # Sessions that must be removed for the others to agree.
         for k, name in enumerate(names):
             rest = np.arange(len(names)) != k
             if chance_of(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
@@ -221,7 +221,7 @@ def _displacements(first: Calibration, second: Calibration) -> dict[float, float
 
 
 def _spread(T: Array, cov: Array) -> float:
-    """Compute chi2: the least sum of squared Mahalanobis distances from one pose."""
+    """Compute chi2, the minimum sum of squared Mahalanobis distances from one pose."""
     weights = np.asarray(np.linalg.inv(cov))
     deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))

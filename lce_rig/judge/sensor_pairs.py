@@ -1,4 +1,4 @@
-"""Two sensors that saw the same boards: whether their extrinsics agree, and their names are not exchanged.
+"""Check whether the extrinsics of two sensors that saw the same boards agree, or are exchanged.
 
 Each still board that two cameras see gives T_second_first = T_second_board T_first_board^-1 without any
 LiDAR. The extrinsics of both cameras with one LiDAR give the same pose independently.
@@ -48,7 +48,7 @@ from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig
 
-# Fewer placements do not determine the scatter.
+# Minimum number of placements to determine the scatter.
 _MIN_PLACEMENTS = 4
 # Fewer placements do not determine the shape of the scatter; that of typical errors is used.
 _MIN_JACKKNIFE = 10
@@ -188,7 +188,7 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
 
 
 class CameraEvidence(NamedTuple):
-    """A calibrated camera, as far as its name can be wrong.
+    """A calibrated camera, with the figures to detect exchanged names.
 
     Attributes:
         name: name of the camera.
@@ -207,7 +207,7 @@ class CameraEvidence(NamedTuple):
 def find_exchanged_cameras(
     rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence
 ) -> list[Finding]:
-    """Find two cameras whose images came under each other's name.
+    """Find two cameras whose images are exchanged.
 
     Exchanged, they fit the profile better: the nominal poses by more than chance allows, tolerances taken as
     three standard deviations; or the lenses, where boards contradict both profiles.
@@ -235,7 +235,7 @@ def find_exchanged_cameras(
 
 
 def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> float:
-    """Compute the fall of chi-squared about the nominal poses if two cameras are exchanged."""
+    """Compute how much chi-squared about the nominal poses decreases if two cameras are exchanged."""
     nominal = [rig.nominal(each.name, lidar) for each in (first, second)]
     if None in nominal:
         return 0.0
@@ -297,7 +297,7 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
 
 
 def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetection]) -> list[Finding]:
-    """Find a LiDAR whose scans have rings that its model lacks, as when two came under each other's name.
+    """Find a LiDAR with rings that its model lacks, for example because two LiDARs are exchanged.
 
     Args:
         name: name of the LiDAR.
@@ -318,7 +318,7 @@ def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetec
 def find_exchanged_lidars(
     T_first_second: Array, nominal: NominalExtrinsic | None, names: str, lidars: Sequence[LidarSettings]
 ) -> list[Finding]:
-    """Find two LiDARs whose scans came under each other's name.
+    """Find two LiDARs whose scans are exchanged.
 
     Exchanged, the estimate is the inverse, and boards fit as well. Without a nominal pose only the scans of a
     LiDAR with more rings show it; otherwise the result cannot pass.
@@ -364,7 +364,7 @@ class Loop(NamedTuple):
 
 
 def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
-    """Compare the pose of two LiDARs with that by a sensor calibrated to both.
+    """Compare the pose of two LiDARs with that via a sensor calibrated to both.
 
     All three results have seen the same boards: their errors are counted as independent.
     """

@@ -47,7 +47,7 @@ class Meeting:
 
     @property
     def way_m(self) -> float:
-        """Distance that the board's middle moved between scan and image."""
+        """Distance that the board's centre moved between scan and image."""
         before, after = self.measured.surface.T_lidar_board, self.lidar_at_image_time.T_lidar_board
         return float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
@@ -83,7 +83,7 @@ def bring_together(
     own = list(timed[channel])
     if not own:
         return {}
-    # A capture's own image counts, if several hold the same scan.
+    # If several captures hold the same scan, use the capture's own image.
     scans = [SharedScan((o.capture,), {**by_scan[scan_key(o)], channel: o.image}, o.lidar) for o in own]
     samples = sample_poses(scans, clocks, {name: of_channel[name].noise_px for name in timed})
     offset_s = np.array([of_channel[name].time_offset_s for name in samples.channels], dtype=np.float64)
@@ -163,7 +163,7 @@ class SessionCheck:
     page: Path | None = None
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         names = ("plane_mean_m", "plane_rms_m", "edge_mean_m", "edge_rms_m", "reprojection_px")
         used = self.calibration.captures_used
         return {
@@ -194,7 +194,7 @@ class SessionCheck:
 
 
 def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
-    """Replace figures that are not known by null, for JSON."""
+    """Replace unknown figures by null, for JSON."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 

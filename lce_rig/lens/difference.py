@@ -22,7 +22,7 @@ _LEAST_ALIGNED = 10
 
 
 class LensDifference(NamedTuple):
-    """Distance between the pixels of two lens models for the same rays, at places with boards.
+    """Pixel distance between two lens models for the same rays, at board positions.
 
     Attributes:
         rms_px: rms distance; infinite if the first model projects none of the pixels.
@@ -52,7 +52,7 @@ class LensCertainty:
 
     @property
     def covered(self) -> float:
-        """Share of the image in which boards were seen."""
+        """Fraction of the image in which boards were detected."""
         return float(self.is_covered.mean())
 
     @property
@@ -125,7 +125,7 @@ def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: Len
 
 
 def turn_of_lens(intrinsics: Intrinsics) -> Array:
-    """Find the rotation of the camera (3, P) that projects like a change of each parameter of its lens."""
+    """Find the camera rotation (3, P) with the same effect on pixels as a change of each lens parameter."""
     model, rays = model_of(intrinsics), intrinsics.unproject(_grid(intrinsics).reshape(-1, 2))
     turn, _ = _best_turn(model, model.vector(intrinsics), rays[np.isfinite(rays).all(axis=1)])
     return -turn

@@ -1,4 +1,4 @@
-"""Intrinsics from the corners of many boards: least squares over the lens, the board's shape and every pose.
+"""Intrinsics from the corners of many boards: least squares over lens, board shape and all poses.
 
 Lens and board are shared by all images, the pose is each one's own: the normal equations have an arrow's
 shape, and eliminating the poses (Schur) leaves one small system however many images there are.
@@ -28,7 +28,7 @@ BOW_SIGMA_M = 0.003
 BEND_SIGMA_M = 0.001
 ASPECT_SIGMA = 0.002
 PRINT_SIGMA_M = 1e-4
-# A board that the profile states to be exact.
+# A board stated as exact in the profile.
 _EXACT_M = 1e-7
 # Bow along width and height, aspect, five further bends, seven smooth displacements of the pattern; then the
 # corners' own offsets.
@@ -181,7 +181,7 @@ def board_shapes(board: Board) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class LensState:
-    """Values of every unknown.
+    """Values of all unknowns.
 
     Attributes:
         lens: (P,) parameters of the lens model.
@@ -208,7 +208,7 @@ class LensState:
 
 
 def corners_of(setup: Setup, shape: Array) -> Array:
-    """Place the board's corners (N, 3) according to its shape (S,), frame board, m."""
+    """Return the board's corners (N, 3) deformed by its shape (S,), frame board, m."""
     return np.asarray(setup.corners_board + np.tensordot(shape, setup.shapes, axes=1))
 
 
@@ -263,7 +263,7 @@ def refit_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) ->
 
 
 def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) -> tuple[Array, Array, Array]:
-    """Fit poses of boards (K, N, 2) to an estimated lens and board, each alone.
+    """Fit poses of boards (K, N, 2) to an estimated lens and board, each separately.
 
     Returns:
         T_cam_board (K, 4, 4), costs (K,) px^2 and information (K, 6, 6) for corners of 1 px.
@@ -276,7 +276,7 @@ def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) ->
 
 
 def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Array, errors: Array) -> Array:
-    """Compute how far fitted poses move with lens and board.
+    """Compute how fitted poses change with lens and board.
 
     Args:
         estimate: estimate of both.
@@ -294,7 +294,7 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
 
 
 def fit_readout(estimate: IntrinsicsEstimate) -> tuple[Array, Array]:
-    """Fit to each view of an estimate that its rows were read out one after another while the board moved.
+    """Fit a rolling shutter, rows exposed in turn while the board moved, to each view of an estimate.
 
     Corners are displaced by the board's motion since the middle row, in proportion to their row. Most of that
     a pose takes up; the rest shears the board, as no pose does.
@@ -407,7 +407,7 @@ def _step(
 
 
 def solve_scaled(H: Array, right: Array) -> Array:
-    """Solve H x = right for unknowns of very different units."""
+    """Solve H x = right for unknowns of very different units, by scaling."""
     scale = 1.0 / np.sqrt(np.diag(H))
     scaled = H * np.outer(scale, scale)
     return np.asarray((np.linalg.solve(scaled, (right.T * scale).T).T * scale).T)

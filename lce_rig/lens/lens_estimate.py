@@ -172,7 +172,7 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
 
 
 def reach(estimate: IntrinsicsEstimate) -> float:
-    """Measure how far boards reach from the principal point to the image's farthest corner, 0..1."""
+    """Return how far boards reach from the principal point to the image's farthest corner, 0..1."""
     i = estimate.intrinsics
     centre = np.array([i.cx_px, i.cy_px])
     ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])

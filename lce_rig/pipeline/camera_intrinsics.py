@@ -84,7 +84,7 @@ class MeasuredIntrinsics:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The estimate, rounded as in every file."""
+        """The estimate, rounded as in the written files."""
         lens = self.estimate.intrinsics
         pixels = {key: round(getattr(lens, key), 4) for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
         return replace(lens, **pixels, distortion=tuple(round(value, 8) for value in lens.distortion))
@@ -265,7 +265,7 @@ def _fit(
     ]
     board = rig.board.to_board()
     lens_model = model_of(start) if model is None else MODELS[model]
-    # As `calibrate` weighs them; the profile's have no part in another model or resolution.
+    # Same weights as in `calibrate`; the profile is not used for another model or resolution.
     prior = LensPrior.read(rig.cameras[camera], rig.board)
     sizes = [(lens.width_px, lens.height_px) for lens in (start, prior.lens)]
     is_comparable = sizes[0] == sizes[1] and lens_model == model_of(prior.lens)
@@ -273,7 +273,7 @@ def _fit(
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ in one step: a camera_info file for each camera.
+    """Write the session's intrinsics/ in one step: one camera_info file per camera.
 
     Other files there stay, as those of cameras that an earlier run measured.
 
@@ -357,7 +357,7 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
 
 
 def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
-    """List the figures as plain types; those that could not be computed are null."""
+    """List the figures as plain types; unknown ones are null."""
     return {
         "rig": rig.name,
         "made_by": MADE_BY,

@@ -21,7 +21,7 @@ from lce_rig.session.identity import differing_keys
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """Sessions of one rig, or results of one session, compared.
+    """Sessions of one rig, or results of one session, and their comparison.
 
     Attributes:
         rig: the rig's name.
@@ -40,7 +40,7 @@ class Repeat:
 
 
 def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
-    """Compare the results that one session holds, such as those of frames and of events.
+    """Compare the results in one session, such as those of frames and of events.
 
     Args:
         folder: folder of the session.
@@ -137,7 +137,7 @@ def _require_same(sessions: Mapping[str, Session]) -> None:
 
 
 def _require_independent(sessions: Mapping[str, Session]) -> None:
-    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
+    """Refuse sessions that share images or scans: a copy always agrees with its original."""
     hashes: dict[str, set[str]] = {name: set() for name in sessions}
     for name, session in sessions.items():
         for capture in session.captures:

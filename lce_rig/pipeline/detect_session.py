@@ -102,7 +102,7 @@ def detect_boards(
 
 
 def unlike_models(session: Session, detections: Detections) -> list[Finding]:
-    """Compare the first scan of each LiDAR with the beams of its model, as `collect` does.
+    """Compare the first scan of each LiDAR with its model's beams, as in `collect`.
 
     Boards are also found in scans with skipped points, at wrong places. Refusals that name these suffice.
 

@@ -119,7 +119,7 @@ class EventCameraFile:
             self.notes += [note for note in notes if note not in self.notes]
 
     def _open_frames(self, file: Aedat4File) -> tuple[Aedat4File, int, str] | None:
-        """Find the frames of an AEDAT4 file, the number of their stream and their channel; None without."""
+        """Find the images of an AEDAT4 file: their stream number and channel; None without images."""
         number = file.first_stream("frame")
         if number is None:
             return None
@@ -132,7 +132,7 @@ class EventCameraFile:
             self.notes.append(f"{self.path.name}: {note}")
             return None
         self.streams.add(Stream(self._camera, channel, "images"))
-        # Those of a file full of events are fewer.
+        # A file with many events has fewer images.
         self.n_samples = max(1, self.path.stat().st_size // first.pixels.nbytes)
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:
