@@ -109,7 +109,7 @@ def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
     """
     if board.type == "plain":
         return np.zeros(xy_m.shape[:-1], dtype=np.bool_)
-    # From the upper left end of the print, right and down.
+    # Position right and down from the pattern's upper left corner.
     width_m, height_m = board.pattern_size_m
     right = (xy_m[..., 0] - board.pattern_offset_m[0] + width_m / 2) / board.square_m
     down = (board.pattern_offset_m[1] - xy_m[..., 1] + height_m / 2) / board.square_m

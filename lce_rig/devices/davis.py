@@ -33,7 +33,7 @@ _RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
 _US_S = 1e6
 _US = timedelta(microseconds=1)
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
-_OTHER_MODEL = "Is it another model? Check driver.device and resolution_px."
+_OTHER_MODEL = "Check driver.device and resolution_px: it may be another model."
 _CHECK = (
     "Check the USB 3 cable, `lsusb | grep 152a`, iniVation's udev rules (else only root may open it), and "
     "that no other program (DV, a ROS driver) holds it."
@@ -104,7 +104,7 @@ class DavisSource(LiveSource):
         for name, channel in self._settings.channels.items():
             if not self._has[channel.kind]:
                 what = f"{self._label}: {self._opened.device} has no {channel.kind} for channel {name!r}"
-                raise SourceError(what, "Is it another model? Check driver.device, or delete the channel.")
+                raise SourceError(what, "Check driver.device and the model, or delete the channel.")
 
     def close(self) -> None:
         """Close the camera."""
@@ -151,7 +151,7 @@ class DavisSource(LiveSource):
             # A file has ended when its last stream has, a camera is gone when any is.
             is_running = getattr(self._input, "isRunningAny", self._input.isRunning)
             if not is_running():
-                hint = "Was it unplugged? Check cable and power; then start again."
+                hint = "Check cable and power; then start again."
                 raise SourceError(f"{self._label}: {self._opened.device} is gone", hint)
             time.sleep(_PAUSE_S)
         return samples

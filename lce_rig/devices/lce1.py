@@ -69,7 +69,7 @@ class TimeReply(NamedTuple):
 
 
 class BoardStatus(NamedTuple):
-    """State of the board, once per second: flags, and the number of lines that the host has not read."""
+    """State of the board, once per second: flags, and the number of lines not read by the host."""
 
     flags: int
     n_lost: int

@@ -76,7 +76,7 @@ class ImagePipeSource(LiveSource):
                 start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
             )
         except OSError as error:
-            hint = "Is the program installed? Give its full path."
+            hint = "Install the program, or give its full path."
             what = f"{self._label}: {command[0]} cannot be started: {error.strerror}"
             raise SourceError(what, hint) from None
         self._stack.callback(_end_process, self._process)

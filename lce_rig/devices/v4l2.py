@@ -1,7 +1,7 @@
 """A V4L2 camera: images with the kernel's timestamps and sequence numbers, in UTC.
 
-Drivers say CLOCK_MONOTONIC. Jetson's do too, and use a counter that is seconds away from it. So every clock
-is tried on the timestamps: an image is younger than 0.2 s when it arrives, and never of the future.
+Drivers report CLOCK_MONOTONIC. Jetson's drivers also do, but use a counter that differs from it by seconds.
+Therefore every clock is tested on the timestamps: on arrival, an image must be 0 to 0.2 s old.
 
 References:
     https://docs.kernel.org/userspace-api/media/v4l/buffer.html (V4L2_BUF_FLAG_TIMESTAMP_*)
@@ -277,7 +277,7 @@ class V4l2Source(LiveSource):
         wanted = self._settings.driver.pixel_format
         code = find_format(wanted) if wanted else next((c for c in offered if c in FORMATS), None)
         if code is None or (offered and code not in offered):
-            what = f"does not offer pixel format {wanted}" if wanted else "offers no pixel format read here"
+            what = f"does not offer pixel format {wanted}" if wanted else "offers no supported pixel format"
             listing = ", ".join(c.strip() for c in offered) or "none"
             raise SourceError(
                 f"{where} {what}",

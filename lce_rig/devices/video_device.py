@@ -192,7 +192,7 @@ class VideoDevice:
         where = f"camera {self._sensor!r}: {self.path}"
         if error.errno in (errno.ENODEV, errno.ENXIO) or not Path(self.path).exists():
             if self._buffers:
-                hint = "Was it unplugged? Check cable and power, `dmesg | tail`; then start again."
+                hint = "Check cable and power, `dmesg | tail`; then start again."
                 return SourceError(f"{where} is gone", hint)
             return SourceError(f"{where} is not there", _attached())
         if error.errno in (errno.EACCES, errno.EPERM):

@@ -279,7 +279,7 @@ class Registry:
         return f"{robot}/{names[-1]}" if names else None
 
     def rows(self, folder: str) -> list[Row]:
-        """Read the rows of one result: none without a result, one with a cause if its files are damaged."""
+        """Read the rows of one result: none without a result; one with the cause for damaged files."""
         place = self.place / folder
         robot, _, name = folder.partition("/")
         names = {"robot": robot, "folder": folder}

@@ -164,7 +164,7 @@ def _fits(size_px: Sequence[int], image_px: Sequence[int]) -> bool:
 
 
 def _other_size(lens: Intrinsics, image_px: tuple[int, int]) -> str:
-    """Report intrinsics for another size than the images', and those of scaled images."""
+    """State that the intrinsics are for another image size; add scaled ones if the aspect ratio fits."""
     width, height = image_px
     text = f"it belongs to {lens.width_px}x{lens.height_px} px, the images have {width}x{height} px"
     share = width / lens.width_px

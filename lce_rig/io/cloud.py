@@ -103,7 +103,7 @@ def _elevation_peaks(elevation: Array) -> Array:
 
 
 def _nearest_line(rho: Array, z: Array, lines: Array) -> tuple[NDArray[np.intp], Array]:
-    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines rise."""
+    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines ascend."""
     # Limit an offset's shift of a point to the distance between neighbouring lines.
     guess = np.searchsorted((lines[1:, 0] + lines[:-1, 0]) / 2, z / rho)
     nearest, miss = guess, np.abs(z - rho * lines[guess, 0] - lines[guess, 1])

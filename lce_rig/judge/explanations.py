@@ -210,7 +210,7 @@ class Poses(NamedTuple):
             yield Explanation("moved", is_own.astype(np.float64), len(cuts), cut)
 
     def candidates(self) -> Iterator[Explanation]:
-        """List moves before each capture, single captures, the two groups that differ most, and a drift."""
+        """List candidates: moves at each capture, single captures, the two most different groups, a drift."""
         yield from self.moves()
         F = len(self.gradient)
         order = np.arange(F)

@@ -121,7 +121,7 @@ class IntrinsicsCheck:
 
     @property
     def _sure(self) -> float:
-        """Number of standard deviations that is significant, with few captures more than for a normal one."""
+        """Significance threshold in standard deviations, larger with few captures."""
         from scipy.special import stdtrit  # scipy.stats takes a second to import
 
         return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))

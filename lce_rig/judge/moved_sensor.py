@@ -56,7 +56,7 @@ class PairCosts:
         validation: Validation,
         T_view: Array | None = None,
     ) -> "PairCosts":
-        """Take them from an estimate and its checks; T_view None for the first sensor's own frame."""
+        """Collect captures and costs of an estimate and its checks; T_view None: the first sensor's frame."""
         T_view = np.eye(4) if T_view is None else T_view
         T_first_second = np.asarray(invert(T_view) @ estimate.T_cam_lidar)
         reasons = [f for f in validation.causes if f.code == MOVED.code and f.severity != "note"]

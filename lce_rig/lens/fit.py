@@ -280,9 +280,9 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
 
     Args:
         estimate: estimate of both.
-        corners_px: (K, N, 2) of boards.
-        T_cam_board: (K, 4, 4) of these.
-        errors: (n, P + 15) added to lens and shape.
+        corners_px: (K, N, 2) corners of K boards.
+        T_cam_board: (K, 4, 4) poses of these boards.
+        errors: (n, P + 15) errors added to lens and shape.
 
     Returns:
         (n, K, 6) tangents -(sum J^T J)^-1 sum J^T G error, with J and G the derivatives of the corners.

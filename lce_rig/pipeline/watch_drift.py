@@ -1,4 +1,4 @@
-"""Check deployed extrinsics on recordings without a board: the edges of the scene decide.
+"""Check deployed extrinsics on recordings without a board, by the edges of the scene.
 
 Captures come from sessions, recordings of all kinds and attached sensors, in bounded memory.
 """
@@ -45,14 +45,14 @@ _Item = TypeVar("_Item")
 
 
 class Thinned(list[_Item]):
-    """The items of a stream, every one at first, every second once there are too many, and so on."""
+    """Items spread over a stream: every one at first, every second once there are too many, and so on."""
 
     def __init__(self) -> None:
         super().__init__()
         self._n_taken, self._stride = 0, 1
 
     def take(self, item: _Item) -> None:
-        """Keep an item if it is its turn."""
+        """Keep an item if it is due."""
         if self._n_taken % self._stride == 0:
             self.append(item)
         self._n_taken += 1
@@ -150,7 +150,7 @@ class SceneCaptures:
             raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")
 
     def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
-        """Read attached sensors until it is over.
+        """Read attached sensors until the time is over.
 
         Raises:
             SourceError: a sensor cannot be opened.
@@ -170,7 +170,7 @@ class SceneCaptures:
             self.notes += [error.what for error, _ in sensors.lost().values()]
 
     def take_frame(self, frame: Frame) -> None:
-        """Take the rig's samples of one time of a continuous recording."""
+        """Take the rig's samples at one time of a continuous recording."""
         self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
         self._last = {scan.sensor: self._rig.corrected(scan) for scan in frame.scans}
 
@@ -180,7 +180,7 @@ class SceneCaptures:
         for c, kept in zip(self._pairs, self.kept, strict=True):
             scan = next((each for each in scans if each.sensor == c.lidar), None)
             own = [image for image in images if image.sensor == c.camera]
-            # Frames before images that were made of events.
+            # Prefer frames to images reconstructed from events.
             frames = self._rig.cameras[c.camera].first_channel("frames")
             own = [image for image in own if image.channel == frames] or own
             if scan is None:
@@ -212,7 +212,7 @@ class SceneCaptures:
 
 
 def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
-    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
+    """Copy the events around the LiDAR's scan of the camera's field of view; None if there are none."""
     scan_ns = rig_time_ns(scan, rig)
     if scan_ns is None or scan.offset_ns is None or not len(scan.points):
         return None

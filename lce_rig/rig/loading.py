@@ -25,7 +25,7 @@ KeyPath = tuple[str | int, ...]
 BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
 """Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
 _SUFFIXES = (".yaml", ".yml")
-# The words of pydantic's messages, and those of ours.
+# Texts of pydantic's messages, and their replacements.
 _REWORDED = (
     ("Input should", "must"),
     ("Tuple should", "must"),

@@ -77,7 +77,7 @@ BOARD, PPS_LINE = "sync", "pps"
 """Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
 # CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
 _ROUNDING = 5e-3
-# Two sensors of one rig are not farther apart; larger figures are millimetres.
+# Largest distance of two sensors of one rig, m; larger figures are in millimetres.
 _Metres = Annotated[float, Field(ge=-20, le=20)]
 
 
@@ -291,7 +291,7 @@ class Rig(Settings):
         return self.cameras[extrinsics.camera].to_intrinsics() if own is None else own
 
     def with_lenses(self, extrinsics: Sequence[Calibration]) -> "Rig":
-        """Replace the cameras' intrinsics by those that belong to extrinsics; the first of a camera count."""
+        """Replace the cameras' intrinsics by those used with extrinsics; the first of each camera counts."""
         cameras = dict(self.cameras)
         for each in reversed(extrinsics):
             if each.lidar in cameras and each.lidar_intrinsics is not None:

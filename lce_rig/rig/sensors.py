@@ -25,7 +25,7 @@ MAX_PIXELS = 1 << 26
 
 LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
-# Beyond this the figure is in millimetres, or the sensor is broken.
+# Limit above which a figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
@@ -194,7 +194,7 @@ class LidarSettings(Settings):
 
     @property
     def has_rings(self) -> bool:
-        """Whether its beams sweep cones about its axis, as those of LiDARs of unknown models do."""
+        """Whether its beams sweep cones about its axis; assumed for unknown models."""
         sheet = self.data_sheet()
         return sheet is None or sheet.has_rings or self.elevations_deg is not None
 

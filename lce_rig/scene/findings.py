@@ -1,4 +1,4 @@
-"""Kinds of findings of a scene's edges, and of boards in view, on deployed extrinsics."""
+"""Kinds of findings on deployed extrinsics, from a scene's edges and boards in view."""
 
 from lce_rig.core.findings import Kind
 

@@ -76,13 +76,13 @@ class OutlineScore:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         order = [np.argsort(view.outlines.kind == LEVEL, kind="stable") for view in views]
         outlines = [view.outlines.select(each) for view, each in zip(views, order, strict=True)]
-        # Coordinates one behind the other: numpy takes them apart faster.
+        # Store each coordinate contiguously: numpy processes them faster.
         self._points = np.concatenate([each.points for each in outlines]).T.copy().T
         weight = np.concatenate([each.weight for each in outlines])
         self._weight = weight / max(weight.sum(), 1e-12)
         self._kind = np.concatenate([each.kind for each in outlines])
         self._view = np.repeat(np.arange(len(views)), [len(each) for each in outlines])
-        # Upright outlines and reflectivities of a view first, then its level outlines.
+        # Vertical outlines and reflectivities of a view first, then its horizontal outlines.
         counts = [(int(np.sum(each.kind != LEVEL)), int(np.sum(each.kind == LEVEL))) for each in outlines]
         ends = np.cumsum([0, *(count for pair in counts for count in pair)]).tolist()
         self._layers = [
@@ -140,7 +140,7 @@ class OutlineScore:
         return float(shares.sum()), np.concatenate([slope[:3], left.T @ slope[3:]])
 
     def of_matching_views(self, tangent: Array) -> float:
-        """Score extrinsics by the views that match better than by chance: the others say nothing."""
+        """Score extrinsics by the views that match better than by chance; the others have no weight."""
         shares, _, _ = self.edges(tangent)
         total, weight = (np.bincount(self._view, each) for each in (shares, self._weight))
         matches = total > 0

@@ -30,7 +30,7 @@ _MIDDLE = 0.36
 _MOST_STEPS, _MOST_EQUAL_STEPS = 5, 8
 # Share of the range that stays free on either side.
 _MARGIN = 0.05
-# Farther marks are moved here, outside every drawing.
+# Distant marks are moved here, outside every drawing.
 _FAR = 1e4
 # An arrow's half-widths of shaft and head, and the length of its head.
 _SHAFT, _HEAD, _HEAD_LENGTH = 0.6, 1.8, 5.4

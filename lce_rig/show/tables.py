@@ -35,7 +35,7 @@ class Table(NamedTuple):
 
 
 def result_tables(c: Calibration) -> dict[str, Table]:
-    """List all tables of a result, in the order in which they are read."""
+    """List all tables of a result, in reading order."""
     first = c.camera if c.is_of_peers else "the camera"
     pose = f"Pose of {c.lidar} on {c.camera}" if c.is_of_peers else "Pose of the camera on the LiDAR"
     points = [

@@ -87,7 +87,7 @@ class Backdrop:
 def build_backdrop(
     room: Room, T_world_cam: Array, intrinsics: Intrinsics, *, is_draft: bool = False
 ) -> Backdrop:
-    """Render the standing room as a camera at T_world_cam (4, 4) sees it; a draft without anti-aliasing."""
+    """Render the static room from a camera at T_world_cam (4, 4); a draft without anti-aliasing."""
     shape = (intrinsics.height_px, intrinsics.width_px)
     origin = T_world_cam[:3, 3]
     corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
@@ -187,7 +187,7 @@ def beside_changes(changes_down: NDArray[np.bool_], changes_across: NDArray[np.b
 
 
 def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Array]:
-    """Compute the radiance, linear (N, 3), and range (N,), m, that rays (N, 3) see of the standing room.
+    """Compute the radiance, linear (N, 3), and range (N,), m, of the static room along rays (N, 3).
 
     Pieces that fit the cache and the memory are rendered one after the other.
     """

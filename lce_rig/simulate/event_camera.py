@@ -65,7 +65,7 @@ class _Raw:
 
 
 class EventCamera:
-    """An event camera: takes the scene's intensities in order of time and returns events.
+    """An event camera: converts the scene's intensities, in order of time, to events.
 
     Args:
         pixels: the sensor.

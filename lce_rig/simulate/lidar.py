@@ -1,4 +1,4 @@
-"""A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and the errors of real ones."""
+"""A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and realistic errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Returns:
 
 
 def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Find the return of each beam; only a beam whose footprint may touch several surfaces is split.
+    """Find the return of each beam; only beams whose footprint may hit several surfaces are split.
 
     Args:
         scene: the surfaces.
@@ -94,7 +94,7 @@ def _touches_several(
 
 
 def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Blend a footprint's echoes closer together than the pulse; of the groups left, report the strongest."""
+    """Blend a footprint's echoes closer together than the pulse; report the strongest remaining one."""
     n, k = len(origins), len(_CELLS)
     sub_origins, sub_directions = _sub_rays(origins, directions, _CELLS, noise)
     flat_origins, flat_directions = sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3)
@@ -259,7 +259,7 @@ def sweep_scene(
     board_at: Callable[[NDArray[np.int64]], Array] | None = None,
     lidar_at: Callable[[NDArray[np.int64]], Array] | None = None,
 ) -> Sweep:
-    """Send the beams of one revolution.
+    """Trace the beams of one revolution.
 
     Args:
         scene: the surfaces that the beams meet.

@@ -1,4 +1,4 @@
-"""The room around the rig, with objects that must not be mistaken for the board, and the board's carrier."""
+"""The room around the rig, with decoys for the board detection, and the board's carrier."""
 
 from dataclasses import dataclass
 
@@ -176,7 +176,7 @@ def _backwards(T_world_board: Array) -> Array:
 
 
 def _clearance(bodies: Array, board: Board, T_world_board: Array, gap_m: float) -> float:
-    """Find how far bodies must move backwards so that all they have near the plate lies `gap_m` behind it.
+    """Compute how far bodies must move backwards so that their parts near the plate are `gap_m` behind it.
 
     Args:
         bodies: (N, 3) points all over them, m, world.

@@ -1,4 +1,4 @@
-"""The constants of a simulated session: the room, the sensors' true poses and their own errors."""
+"""The constants of a simulated session: the room, the sensors' true poses and errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -71,7 +71,7 @@ class Stage:
         return [name for name in self.backdrops if self.rig.cameras[name].first_channel("frames")]
 
     def rng(self, *stream: int) -> np.random.Generator:
-        """Begin a stream of random numbers of this session or of one of its captures."""
+        """Start a stream of random numbers of this session or of one of its captures."""
         return np.random.default_rng([self.seed, *stream])
 
     def measure(self, lidar: str, sweep: Sweep, rng: np.random.Generator, stamp_ns: int) -> Scan:

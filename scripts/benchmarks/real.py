@@ -165,7 +165,7 @@ def _halves(
 
 
 def _apart(first: Calibration, second: Calibration) -> tuple[tuple[float, float], float]:
-    """Compare two results as they draw points: their difference, and how far apart they place boards, mm."""
+    """Compare two results by projected points: their difference, and the distance between boards, mm."""
     lens = first.intrinsics
     T = [c.T_cam_lidar if lens is None else equivalent_extrinsics(c, lens) for c in (first, second)]
     boards = [o.lidar.T_lidar_board[:3, 3] for c in (first, second) for o in c.observations.values()]

@@ -50,7 +50,7 @@ def test_board_drift_unchanged_extrinsics_pass() -> None:
     for seed in range(6):
         board = watched(deployed(np.zeros(6)), seed)
         assert (board.joint.is_changed, board.joint.axes) == (False, ())
-        # What boards cannot see is a note.
+        # Directions that boards do not determine are a note.
         assert [f.severity for f in board.findings if f.code == "scene.board_hides"] == ["note"]
 
 

@@ -1,4 +1,4 @@
-"""Two cameras before the same boards: silent where both are sound, outspoken where one was moved."""
+"""Two cameras with the same boards: no finding if both are right, a finding if one was moved."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
 
 
 def observed(session):
-    """Pair both cameras' boards as a calibration would, whose consensus is not what is tested."""
+    """Pair both cameras' boards as a calibration would; its consensus is tested elsewhere."""
     return list(zip(session[LEFT], session[RIGHT], strict=True))
 
 
@@ -74,14 +74,14 @@ def test_images_nudged_camera_is_found(seed, nudge, figure, size):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_stale_extrinsics_contradict_images(seed):
-    """An extrinsic made before the camera was turned, captures of both from after it."""
+    """Extrinsics from before the camera was rotated, and captures of both cameras from after it."""
     session = simulate_two(12, seed)
     left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
     stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
     (apart,) = findings(relate(left, stale))
     assert apart.code == "verdict.cameras_differ"
     assert apart.subject.split(" to ") == [LEFT, RIGHT]
-    # Boards lie 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
+    # Boards are 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
     assert 0.025 < apart.figure("rms_m") < 0.055
 
 

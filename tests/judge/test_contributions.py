@@ -1,4 +1,4 @@
-"""The parts of the reported covariance: the profile's errors, and what checks contradict."""
+"""Parts of the reported covariance: errors of the profile, and contradictions."""
 
 from dataclasses import replace
 

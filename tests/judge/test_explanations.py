@@ -137,7 +137,7 @@ def test_explain_scattered_images_is_no_moved_sensor():
 
 
 def test_explain_level_of_noise_does_not_hide_a_move():
-    """A noise fitted to captures that moved would widen until it held the move."""
+    """Noise fitted to captures that moved would grow until it explains the move."""
     observations = moved(observed(16, 7), lambda k: k >= 8, [0, 0, 0, np.radians(0.3), 0, 0])
     (found,) = explained(observations)
     assert found.gain.cause == "moved"
@@ -146,7 +146,7 @@ def test_explain_level_of_noise_does_not_hide_a_move():
 
 @pytest.mark.long
 def test_table_chances_of_sound_captures_are_uniform():
-    """A tenth of the chances of an error that is not there lies below a tenth."""
+    """Of the chances of an absent error, one in ten is below 0.1."""
     chances = []
     for seed in range(30):
         observations = observed(14, 100 + seed)

@@ -1,4 +1,4 @@
-"""Repeated calibrations: sound ones agree, an odd one is named, and the finding says by how much."""
+"""Repeated calibrations: correct ones agree, and an outlier is reported with its difference."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def calibration(T, cov=COV, **diagnostics) -> Calibration:
 
 
 def sessions(n, seed, factor=1.0, cov=COV):
-    """Calibrations scattered by `factor` times what their covariance says."""
+    """Draw calibrations scattered by `factor` times their covariance."""
     rng = np.random.default_rng(seed)
     root = factor * np.linalg.cholesky(cov)
     return {f"day{k}": calibration(perturb(TRUTH, root @ rng.standard_normal(6)), cov) for k in range(n)}
@@ -91,7 +91,7 @@ def test_repeat_same_captures_mostly_agree(correlation):
         }
         compared = compare_calibrations(group, are_independent=False)
         n_refused += not compared.agrees
-    # Opposite errors reach the bound: one of a hundred, within 3 sigma of the count.
+    # Errors of opposite sign reach the bound in 1 % of cases; allow 3 sigma of the count.
     assert n_refused <= 3 + 3 * np.sqrt(3)
 
 

@@ -51,7 +51,7 @@ def examined(estimate, lens=CAMERA):
 
 @pytest.fixture(scope="module")
 def verdict_of(estimate):
-    """Judge a changed estimate by what the checks found on the sound one."""
+    """Judge a changed estimate with the checks of the unchanged one."""
 
     def judged(changed, n_captures=20, rig=RIG):
         cov = changed.cov
@@ -252,7 +252,7 @@ def test_arrange_symptoms_follow_the_cause():
     note = LAST_REJECTED(capture="000014")
     listed = arrange([note, plane, squares_off("warning")])
     assert [(f.code, f.severity, f.follows) for f in listed] == [
-        # As severe as what it brings about.
+        # The cause has the severity of its consequences.
         ("verdict.scale", "error", ""),
         ("verdict.plane_residual", "error", "verdict.scale"),
         ("verdict.last_rejected", "note", ""),

@@ -1,4 +1,4 @@
-"""Intrinsics from boards: the truth within its stated deviations, whatever the start and the bad pictures."""
+"""Intrinsics from boards: the truth within the standard deviations, for any start and with bad images."""
 
 from dataclasses import replace
 
@@ -168,7 +168,7 @@ def test_views_of_one_capture_are_held_out_together(views):
     doubled = estimate_intrinsics(twins, BOARD, WIDE, RADTAN5, n_folds=4)
     single = estimate_intrinsics(views, BOARD, WIDE, RADTAN5, n_folds=4)
     assert doubled.held_out_rms_px == pytest.approx(single.held_out_rms_px, rel=0.05)
-    # The same corners twice are no more evidence than once.
+    # Duplicate corners add no information.
     assert np.all(doubled.sigma > 0.8 * single.sigma)
 
 
@@ -178,7 +178,7 @@ def test_too_few_captures_error_states_number(views):
 
 
 def test_parallel_boards_leave_the_focal_length_open():
-    # All in the middle and parallel to the picture: depth and focal length are one.
+    # All boards central and parallel to the image: depth and focal length are not separable.
     scene = Scene(tilt_deg=(0.0, 0.5), spread=(0.49, 0.51), sigma_px=0.3)
     with pytest.raises(NotEnoughDataError):
         estimate_intrinsics(photograph(8, 0, scene), BOARD, WIDE, RADTAN5)

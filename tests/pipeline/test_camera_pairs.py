@@ -1,4 +1,4 @@
-"""Two cameras that saw the same boards, alone or beside a LiDAR that only one of them shares boards with."""
+"""Two cameras that saw the same boards, alone, or with a LiDAR that shares boards with one of them."""
 
 import numpy as np
 import pytest

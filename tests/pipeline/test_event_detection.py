@@ -1,4 +1,4 @@
-"""Raw events of a capture are seen through pictures for the LiDAR's time on the board, made once."""
+"""Images are reconstructed once from raw events, at the time of the board in the scan."""
 
 from dataclasses import replace
 

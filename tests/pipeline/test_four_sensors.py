@@ -68,7 +68,7 @@ def test_exchanged_lidars_are_named_in_all_pairs():
 
 
 def test_moved_sensor_is_named_from_few_captures():
-    """The cameras have one and two captures from before the motion, and one result does not use its own."""
+    """The cameras have one and two captures before the motion, and one result does not use its own."""
     after = perturb(ON_FRONT["rear"], np.r_[0.012, -0.004, 0.016, np.radians([0.5, 0.6, -0.6])])
     results = calibrate(simulate(N, 6, moves={"rear": lambda k: ON_FRONT["rear"] if k < 8 else after}))
     verdicts = {"rear": [], "others": []}

@@ -1,4 +1,4 @@
-"""Intrinsics of a session whose profile may be wrong: found, held against the profile, and written."""
+"""Intrinsics of a session with a possibly wrong profile: estimated, compared and written."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ LENS = RIG.cameras["davis"].to_intrinsics()
 
 @pytest.fixture(scope="module")
 def pictures():
-    """The board eight times all over the picture, as the profile's lens draws it."""
+    """Eight boards over the whole image, projected with the profile's lens."""
     board, rng = RIG.board.to_board(), np.random.default_rng(1)
     drawn = []
     while len(drawn) < 8:
@@ -40,7 +40,7 @@ def pictures():
 
 
 def session_of(path, pictures, channel="frames", **camera):
-    """Make a session of pictures with keys of the camera set to other values."""
+    """Create a session of images with changed keys of the camera."""
     text = RLES
     for key, value in camera.items():
         text = set_value(text, f"cameras.davis.{key.replace('__', '.')}", value)

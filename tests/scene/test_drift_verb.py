@@ -32,7 +32,7 @@ from tests.saved_results import write_result
 
 @pytest.fixture
 def turned(seen, tmp_path):
-    """A result whose extrinsics are turned by 2 deg about the camera's y axis."""
+    """A result with extrinsics rotated by 2 deg about the camera's y axis."""
     T = perturb(seen.truth.T_cam_lidar, np.array([0, 0, 0, 0, np.radians(2.0), 0]))
     write_result(tmp_path / "result.json", seen.rig.name, [replace(seen.truth, T_cam_lidar=T)])
     return tmp_path / "result.json"
@@ -171,7 +171,7 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys):
         words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
         code = run([*words, "--seconds", "10"])
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
-    # One view of the room again and again says no more than once.
+    # Repeated views of the room add no information.
     assert code in (0, 6) and pair["state"] != "changed"
     assert pair["scene"]["n_captures"] > 5
 

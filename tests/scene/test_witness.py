@@ -59,7 +59,7 @@ def contradiction(axis, sigmas, sigma=0.01):
 @pytest.mark.parametrize(("axis", "action"), [("rotation_x", ""), ("translation_z", "distances")])
 def test_scene_contradiction_size_decides_axis_names_cause(seen, sigmas, verdict, axis, action):
     judged = with_opinion(seen.truth, contradiction(axis, sigmas))
-    # The first one is the scene's; that of a marginal result says how wrong it may be.
+    # The first finding is the scene's; that of a marginal result states the error bound.
     finding = judged.findings[0]
     assert judged.verdict == verdict and finding.action == action
     assert finding.figures["axes"] == (axis,)

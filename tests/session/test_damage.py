@@ -1,4 +1,4 @@
-"""Whatever happens to the disk or the process, captures made before are whole, and damage is named."""
+"""Earlier captures survive any failure of disk or process, and damage is reported."""
 
 import signal
 import subprocess
@@ -36,7 +36,7 @@ def test_killed_writer_leaves_whole_captures(tmp_path):
     path = tmp_path / "s"
     promised = set()
     for k in range(6):
-        # The writer's standard output tells which captures it was promised before it died.
+        # The writer's standard output lists the captures reported as saved before it was killed.
         process = subprocess.Popen(
             [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True
         )

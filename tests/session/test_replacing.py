@@ -50,7 +50,7 @@ def test_an_error_leaves_the_earlier_folder(tmp_path):
 
 
 def test_replace_in_linked_session_only(tmp_path):
-    """A link in the place of what is replaced is refused."""
+    """A link in place of the folder to replace is refused."""
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     for text in ("one", "two"):

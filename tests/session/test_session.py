@@ -1,4 +1,4 @@
-"""A session keeps what it was given, exactly, and lets nobody else write to it."""
+"""A session stores data exactly, and has one writer at a time."""
 
 import json
 

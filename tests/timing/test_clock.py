@@ -1,4 +1,4 @@
-"""Offset and drift of clocks: the truth lies within the stated sigmas, jumps are seen, hours completed."""
+"""Offset and drift of clocks: truth within the stated sigmas, jumps detected, hours completed."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ S = 1_000_000_000
 
 
 class Device:
-    """A device whose clock began at a moment of the host's, and goes faster than it by `drift`."""
+    """A device with a clock that starts at a given host time and runs faster than the host's by `drift`."""
 
     def __init__(self, drift, offset_ns=5 * S):
         self.drift, self.offset_ns = drift, offset_ns

@@ -1,4 +1,4 @@
-"""Frames get exactly the events around their scan, in whatever packets these come, with bounded memory."""
+"""Frames get exactly the events around their scan, for any packet sizes, with bounded memory."""
 
 import tracemalloc
 from dataclasses import replace

@@ -25,7 +25,7 @@ def tie(source_ns, reference_ns):
 
 @dataclass
 class Board:
-    """A board whose clock counts from its power-up; the computer is ahead of its UTC by 37 ms."""
+    """A board with a clock that counts from power-up; the computer is 37 ms ahead of its UTC."""
 
     @property
     def host_clock(self):
@@ -92,7 +92,7 @@ def test_rig_clock_images_get_pulse_times():
     for k in range(60):
         sent_ns = 1_000_000_000 + k * PERIOD_NS
         clock.take("sync", Pulse("cam", sent_ns, k + 9, T0_NS + sent_ns + HOST_AHEAD_NS))
-        # The computer stamps the picture 10 ms late, give or take 3.
+        # The computer timestamps the image 10 ms late, +- 3 ms.
         late_ns = 10_000_000 + int(rng.normal(0, 3_000_000))
         image = picture(T0_NS + sent_ns + HOST_AHEAD_NS + late_ns, 100 + k)
         placed = clock.take("cam", image)

@@ -16,7 +16,7 @@ def image(time_ms, channel="frames"):
 
 
 def scan(time_ms, has_times=True):
-    """A sweep of 100 ms whose middle is at `time_ms`."""
+    """A scan of 100 ms with its middle at `time_ms`."""
     offset_ns = np.array([0, 100 * MS]) if has_times else None
     points, zeros = np.ones((2, 3), np.float32), np.zeros(2)
     return Scan(

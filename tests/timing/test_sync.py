@@ -1,4 +1,4 @@
-"""Streams on one clock: how far apart pairs are, how well that is known, and whether boards may move."""
+"""Streams on one clock: time differences of pairs, their uncertainty, and whether boards may move."""
 
 import numpy as np
 import pytest

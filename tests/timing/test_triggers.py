@@ -90,7 +90,7 @@ class Rig:
             number += 1
             if rng.uniform() >= self.lost_frames:
                 came.append((stamp_ms + 30 + rng.uniform(0, self.lag_ms), image))
-        # Each stream keeps its own order; what comes twice comes at once.
+        # Each stream keeps its own order; duplicates arrive together.
         ordered = []
         for kind in (Pulse, Image):
             latest = 0.0

@@ -90,12 +90,12 @@ class Layout:
     Args:
         n_optics: number of unknowns of each lens.
         n_rings: L.
-        lens_of: number of the lens of each camera, its own by default. A camera that moved counts as two.
-        base: the camera in whose frame the boards' poses are, without a LiDAR.
+        lens_of: lens index of each camera; by default each has its own. A camera that moved counts as two.
+        base: without a LiDAR, the camera in whose frame the boards' poses are expressed.
 
     Attributes:
-        z: places in the vector of the unknowns that captures share.
-        row: places in a row [y, z, residual].
+        z: indices in the vector of the unknowns shared by all captures.
+        row: indices in a row [y, z, residual].
     """
 
     def __init__(

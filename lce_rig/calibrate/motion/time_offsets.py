@@ -151,7 +151,7 @@ class _Cost:
     precision: Array
 
     def at(self, offset_s: Array, T_start: Array) -> "_Evaluation":
-        """Solve for the extrinsics at offsets (C,), from T_cam_lidar (4, 4) nearby."""
+        """Solve for the extrinsics at offsets (C,), starting from a nearby T_cam_lidar (4, 4)."""
         motions = fit_motions(self.samples, offset_s)
         poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
         problem = Problem([replace(f, T_cam_board=T, cov=cov) for f, T, cov in poses], self.weights)

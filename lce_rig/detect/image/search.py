@@ -135,11 +135,11 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
     """Crop the grey image to the size of the intrinsics, if it is larger.
 
-    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
-    than the sensor, blank beyond it, of images reconstructed from events.
+    Two harmless differences occur in recordings: a readout that ends a few lines early, and images
+    reconstructed from events with a blank margin beyond the sensor's size.
 
     Raises:
-        ProfileError: a size that cannot be used, naming both.
+        ProfileError: the sizes do not match; the message states both.
     """
     height, width = image.pixels.shape[:2]
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px

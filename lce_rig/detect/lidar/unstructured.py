@@ -228,8 +228,8 @@ class _View(PlaneView):
     def beam_parts_m(self, normals: Array, uv: Array) -> Array:
         """Split half the beam's width on the plane along unit normals (K, 2) at uv (K, 2) by its two axes.
 
-        The spot is an ellipse across the ray, of half widths a and b; on the plane it is drawn out by the
-        plane's turn. Along a normal m of the plane with normal n it reaches
+        The beam's cross-section is an ellipse of half widths a and b; on an oblique plane its footprint is
+        elongated. Along a normal m of the plane with normal n it reaches
 
             h = |diag(a, b) [level, up]^T s|,    s = m - (m . ray) / (n . ray) n                         (1)
 

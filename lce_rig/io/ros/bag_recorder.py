@@ -33,7 +33,7 @@ _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def open_bag_writer(path: Path) -> Any:
-    """Begin a bag: ROS 1 if the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    """Open a bag for writing: ROS 1 for a path ending in .bag, else ROS 2's mcap; a context manager."""
     if path.suffix == ".bag":
         from rosbags.rosbag1 import Writer as Ros1Writer
 

@@ -104,7 +104,7 @@ def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Map
 def draw_from_above(
     calibration: Calibration, evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]
 ) -> Axes:
-    """Draw the plates about the LiDAR as seen from above, with the camera's field of view."""
+    """Draw the plates around the LiDAR from above, with the camera's field of view."""
     # Left is +y of the LiDAR, up is +x.
     plates = [transform(o.lidar.T_lidar_board, board.outline())[:, 1::-1] for o in evidence.observations]
     shown = np.concatenate([*plates, np.zeros((1, 2))])

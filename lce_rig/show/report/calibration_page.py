@@ -72,7 +72,7 @@ def report_page(
         pair = _pair(session.rig, c, f"pair-{k}")
         for capture in pair["captures"]:
             capture["overlays"] = _overlays(session.capture(capture["name"]), c, overlays, has_folders)
-        # As many of each camera, so that the whole page stays small.
+        # Equal numbers for each camera, so that the page stays small.
         n_most = _MOST_PICTURES // len(file.pairs)
         pair["gallery"] = _gallery(session, c, pair["captures"], n_most, thumbnails or {})
         pair["steps"] = _next_steps(c, folder, has_previous)
@@ -131,7 +131,7 @@ def _gallery(
     n_most: int,
     thumbnails: Thumbnails,
 ) -> list[dict[str, Any]]:
-    """List captures with their pictures, those with the largest residuals first."""
+    """List captures with their images, those with the largest residuals first."""
     board, lens = session.rig.board.to_board(), None
     if not c.is_of_lidars:
         lens = session.rig.cameras[c.camera].to_intrinsics()
@@ -179,7 +179,7 @@ def _drawings(
 
 
 def _statement(c: Calibration) -> str:
-    """Sum a result up in one paragraph that anyone can sign, with its figures."""
+    """Summarise a result in one paragraph, with its figures."""
     sensor = c.camera if c.is_of_peers else f"camera {c.camera}"
     known = (
         f"The pose of {sensor} relative to {c.lidar} has a standard deviation of "
@@ -239,7 +239,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
 
 
 _QUALITY, _OUTLINE_BGR = 60, (0, 140, 255)
-# Length of the events in a picture, ns: enough to show the board's edges.
+# Length of the events shown in an image, ns: enough to show the board's edges.
 _EVENTS_NS = 20_000_000
 
 

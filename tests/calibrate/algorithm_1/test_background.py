@@ -91,7 +91,7 @@ def test_background_without_effect_is_unused():
             captures.append(sooner(capture, np.zeros(n), rng.uniform(0, 0.6, n), rng.uniform(0.1, 3.0, n)))
         found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
         n_moved += any(getattr(found, name) for name in NAMES)
-    # Ends that err like this, with returns lost, are moved in one session of a hundred.
+    # With such errors and lost returns, ring ends are shifted in about 1 % of sessions.
     assert n_moved <= 1
 
 

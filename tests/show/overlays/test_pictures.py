@@ -1,4 +1,4 @@
-"""Pictures for people: what must be drawn, what must not, and that sizes and files are right."""
+"""Overlay images: drawn and omitted marks, sizes and files."""
 
 import cv2
 import numpy as np

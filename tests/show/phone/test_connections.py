@@ -1,4 +1,4 @@
-"""Pages that sleep or fail: the others go on, and so does the collection."""
+"""Pages that sleep or fail affect neither other pages nor the collection."""
 
 import time
 

@@ -13,7 +13,7 @@ from .screen import has_text, shown
 
 pytestmark = pytest.mark.realtime
 SIZES = [(360, 640), (640, 360), (1280, 720)]
-# Where the points of an outline lie on the screen.
+# Positions of an outline's points on the screen.
 _ON_SCREEN = """(() => {
   const path = document.querySelector('#%s .ink');
   const matrix = path.getScreenCTM();
@@ -94,7 +94,7 @@ def _compare_with_picture(page, is_mirrored):
 def test_arrow_ends_when_the_board_is_there(preview, browser):
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
-    # From (150, 130) towards (480, 180), whose outline begins at x = 400.
+    # From (150, 130) towards (480, 180), whose outline starts at x = 400.
     shown(preview, page, f"{tip}?.startsWith('M400 167.8')")
     near = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + [40.0, 0.0])
     shown(preview, page, f"{tip} === 'M190 130'", drawing=near)
