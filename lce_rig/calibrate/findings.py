@@ -43,9 +43,9 @@ def _mirrored(finding: Finding) -> str:
 
 
 def _other_order(finding: Finding) -> str:
-    """Images are late, early or reversed ({order}): {n_explained} of {n_captures}, {n_agreeing} as recorded."""
+    """Images are late, early or reversed ({order}): {n_explained} of {n_captures}; {n_agreeing} unchanged."""
     return fill(
-        f"images are {_ORDERS[str(finding.figures['order'])]}, {{n_agreeing}} their own", finding.figures
+        f"images are {_ORDERS[str(finding.figures['order'])]}, {{n_agreeing}} unchanged", finding.figures
     )
 
 
