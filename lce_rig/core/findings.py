@@ -208,11 +208,11 @@ class Losses:
     _examples: dict[tuple[str, str, str], Finding] = field(default_factory=dict)
 
     def add(self, finding: Finding, n: int = 1, *, is_best: bool = False) -> None:
-        """Count more of a kind.
+        """Add to the count of a finding's kind.
 
         Args:
-            finding: one of them.
-            n: number of placements.
+            finding: an example of the kind.
+            n: number to add.
             is_best: keep this one's figures as the example, instead of those of the first.
         """
         if n <= 0:

@@ -193,7 +193,7 @@ def _folders(folder: Path) -> dict[str, Path]:
 
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     visible = [p for p in folder.iterdir() if p.name[0] != "."]
-    # Links to devices are listed, for their reader to name.
+    # Links to devices are listed too: their reader reports them.
     found = [p for p in visible if p.suffix.lower() in suffixes and not p.is_dir()]
     return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
 

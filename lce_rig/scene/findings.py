@@ -31,7 +31,7 @@ DOUBTFUL = Kind(
 )
 UNKNOWN = Kind(
     "scene.unknown",
-    "scene: the edges cannot tell below {smallest_deg:deg}, {smallest_m:mm}",
+    "scene: the edges do not determine changes below {smallest_deg:deg}, {smallest_m:mm}",
     _RECORD,
     severity="warning",
 )

@@ -73,7 +73,7 @@ class Outline(NamedTuple):
 def thin(n: int, most: int) -> Indices:
     """Choose about `most` of n returns at random, with a fixed seed; all if there are fewer.
 
-    Even steps would pick a few of a LiDAR's lines, which recur in order and have the same errors.
+    Regular steps would select only a few of a LiDAR's lines, which recur in order and share errors.
     """
     if n <= most:
         return np.arange(n)

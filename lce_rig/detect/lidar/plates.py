@@ -164,8 +164,8 @@ def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tup
 def _spread_out(centres: Array, cell_m: float) -> Indices:
     """Choose MAX_PAIRS of the pairs at centres (P, 3), best first but distributed over the scan.
 
-    Dense rings lay hundreds of pairs on every wall and floor, all of which grow to the same few planes: each
-    cell of space gives its best pair before any gives its second.
+    Dense rings place hundreds of pairs on every wall and floor, and all of them grow to the same few planes.
+    Therefore each cell of space contributes its best pair before any cell contributes its second.
     """
     cell = np.unique(np.floor(centres / cell_m), axis=0, return_inverse=True)[1].ravel()
     order = np.argsort(cell, kind="stable")

@@ -131,7 +131,7 @@ def test_rig_covariances_fit_errors_of_many_sessions():
                 rows.append((*sizes(errors), claimed, nees(errors, covs)))
                 figures = "rms {:.4f} deg, {:.2f} mm; claimed {:.4f} deg; NEES {:.2f}".format(*rows[-1])
                 print(f"{name} of 20 and {few} captures: {figures}")
-            # No worse than alone, but for chance; for the camera in few captures much better.
+            # Apart from chance, no worse than separate estimates; much better for the camera in few captures.
             assert all(joint < 1.1 * own for own, joint in zip(rows[0][:2], rows[1][:2], strict=True))
             # 6 expected; 20 samples average within 3 standard errors of 0.77. Noise levels of few captures
             # are rather believed to be the usual ones, which are larger than the simulator's.
