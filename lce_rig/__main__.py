@@ -1,4 +1,4 @@
-"""`python -m lce_rig` is `lce-rig`."""
+"""Let `python -m lce_rig` run the command line."""
 
 from lce_rig.cli.entry import main
 

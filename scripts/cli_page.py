@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/cli.md: every verb of the command line with its arguments and options, as `--help` says them."""
+"""Write docs/cli.md: all commands with their arguments and options, from `--help`."""
 
 import inspect
 import sys
@@ -71,7 +71,7 @@ def _verb(group: click.Group, name: str, parent: click.Context, heading: str) ->
 
 
 def _options(command: click.Command, context: click.Context) -> list[tuple[str, str]]:
-    """List options with what they mean; --help itself goes without saying."""
+    """List options with their help; --help itself is omitted."""
     options = [each for each in command.get_params(context) if isinstance(each, click.Option)]
     records = [each.get_help_record(context) for each in options if "--help" not in each.opts]
     return [record for record in records if record is not None]

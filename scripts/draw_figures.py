@@ -53,7 +53,7 @@ def _events() -> None:
 
 
 def _save_debug_picture(rig: str, options: list[str], picture: str, name: str) -> None:
-    """Simulate a session, and keep one of the pictures that `check --debug-images` draws of it."""
+    """Simulate a session, and keep one of the images drawn by `check --debug-images`."""
     with tempfile.TemporaryDirectory() as folder:
         session = str(Path(folder, "session"))
         assert run(["simulate", session, "--rig", rig, *options]) == 0

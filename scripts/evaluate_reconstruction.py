@@ -39,7 +39,7 @@ class BoardScene:
         self.stream = EventStream(1, SIZE_PX, seed, torch.device("cpu"), fronts)
 
     def corners_px(self) -> np.ndarray:
-        """Project the inner corners into the last window's picture, ((COLS - 1) (ROWS - 1), 2)."""
+        """Project the inner corners into the last window's image, ((COLS - 1) (ROWS - 1), 2)."""
         x = (np.arange(1, COLS) - COLS / 2) * self.square
         y = (np.arange(1, ROWS) - ROWS / 2) * self.square
         texels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) * 2 / TEXTURE_PX
@@ -77,7 +77,7 @@ def judge_scene(model: ReconstructionModel, seed: int, n_windows: int, every: in
         ideal = (target[0, 0].numpy().clip(0, 1) * 255).astype(np.uint8)
         ideal_error = corner_error_px(ideal, truth)
         if ideal_error is None:
-            continue  # too oblique or too small even for a perfect picture
+            continue  # too oblique or too small even for a perfect image
         error = corner_error_px(scale.to_grey(picture), truth)
         rate = float((voxels != 0).float().amax(1).mean())
         results.append(

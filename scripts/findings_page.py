@@ -64,7 +64,7 @@ def _row(kind: Kind) -> str:
 
 
 def _figures(template: Template) -> list[str]:
-    """Name the figures of a template; those of a function stand in its docstring, as {name}."""
+    """List the figures of a template; for a function, those in its docstring, as {name}."""
     text = template if isinstance(template, str) else template.__doc__ or ""
     parsed = [(name, spec or "") for _, name, spec, _ in string.Formatter().parse(text) if name]
     names = [each for name, spec in parsed for each in _named(name, spec)]

@@ -1,4 +1,4 @@
-"""What many tests share: values made once a run, changed profiles, waiting, full disks."""
+"""Shared helpers: values made once per run, changed profiles, waiting, full disks."""
 
 import fcntl
 import os
@@ -73,7 +73,7 @@ def wait_until(is_so, patience_s=120.0):
 
 
 def has_ended(pid):
-    """Tell whether a process is gone, or only waits to be reaped."""
+    """Check whether a process is gone, or only waits to be reaped."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] in "ZX"
     except (FileNotFoundError, ProcessLookupError):

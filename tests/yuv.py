@@ -1,4 +1,4 @@
-"""Pictures as cameras deliver them: luma and chroma of ITU-R BT.601, video range."""
+"""Images as delivered by cameras: luma and chroma of ITU-R BT.601, video range."""
 
 import numpy as np
 

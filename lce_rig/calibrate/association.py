@@ -18,11 +18,12 @@ from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
-# Minimum number and fraction of captures that agree with a supposed error undone; few do by chance.
+# Minimum number and fraction of captures that must agree once a supposed error is corrected; few agree by
+# chance.
 _MIN_EXPLAINED, _SHARE = 5, 0.75
-# Minimum number of captures with an error beside a consensus of others.
+# Minimum number of captures with an error when the others have a consensus.
 _MIN_OF_SOME = 2
-# Reflections of an image left to right and top to bottom, as factors of the camera's axes; of the board's.
+# Reflections of an image, left to right and top to bottom: factors of the camera's axes, then of the board's.
 _MIRRORS = np.array([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, 1.0, 1.0]])
 _IN_PLANE = np.array([-1.0, 1.0, 1.0, 1.0])
 
@@ -32,12 +33,12 @@ Candidates = Sequence[Observation]
 def find_association_error(
     candidates: Candidates, board: Board, consensus: Consensus | None
 ) -> Finding | None:
-    """Find the error of association that explains captures without agreement.
+    """Find the association error that explains why captures disagree.
 
     Args:
         candidates: captures with the board in both sensors.
-        board: its specification.
-        consensus: of these captures; None if they agree on no extrinsics.
+        board: the board's specification.
+        consensus: consensus of these captures; None if they agree on no extrinsics.
 
     Returns:
         An error if most captures disagree and one error explains them. If the others suffice for extrinsics,
@@ -52,12 +53,12 @@ def find_association_error(
 
 
 def is_of_all(error: Finding) -> bool:
-    """Check whether an error concerns all captures; a few then agree by chance."""
+    """Check whether an error affects all captures; then only a few agree, by chance."""
     return not error.figures.get("captures")
 
 
 def _of_all(ordered: Candidates, board: Board, n_agreeing: int) -> Finding | None:
-    """Find the error common to all captures: most agree with it undone."""
+    """Find an error common to all captures: once it is corrected, most of them agree."""
     supposed = {
         "mirrored": [_mirrored(item, _MIRRORS[0]) for item in ordered],
         "late": _paired(ordered[1:], ordered),
@@ -84,7 +85,7 @@ def _of_all(ordered: Candidates, board: Board, n_agreeing: int) -> Finding | Non
 
 
 def _of_some(ordered: Candidates, consensus: Consensus) -> Finding | None:
-    """Find the error of captures that disagree with the consensus of the others."""
+    """Find an error of the captures that disagree with the consensus of the others."""
     T, refused = consensus.T_cam_lidar, [item for item in ordered if item.capture in consensus.refused]
     mirrored = [
         item for item in refused if any(agrees_with(_mirrored(item, mirror), T) for mirror in _MIRRORS)
@@ -121,5 +122,5 @@ def _mirrored(item: Observation, mirror: Array) -> Observation:
 
 
 def _paired(images: Candidates, scans: Candidates) -> list[Observation]:
-    """Pair images and scans of different captures one by one; the capture is that of the scan."""
+    """Pair images and scans of different captures one by one; captures are named after the scan."""
     return [replace(scan, pose=image.pose) for image, scan in zip(images, scans, strict=False)]

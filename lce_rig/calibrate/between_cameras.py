@@ -1,4 +1,4 @@
-"""Two cameras that saw the same boards: the captures that agree, and where the estimate of their pose starts.
+"""Two cameras that saw the same boards: agreeing captures, and the initial guess of the relative pose.
 
     fit_session_lens    the intrinsics of each camera
     find_consensus      the captures that agree on one rigid transform
@@ -26,7 +26,8 @@ from lce_rig.core.calibration import Certificate, Diagnostics
 from lce_rig.core.geometry import Array, invert, mean_pose, student_weights, transform
 from lce_rig.core.results import ImageBoard, Observation, PatternBoard
 
-# Standard deviations of a board's pose between two cameras, m and rad: weights of translation and rotation.
+# Standard deviations of a board's pose between two cameras, m and rad: they weight translation against
+# rotation.
 _TYPICAL = np.repeat([3e-3, 2e-3], 3)
 
 
@@ -35,8 +36,8 @@ class StereoPair(NamedTuple):
 
     Attributes:
         start: T_first_second with the captures that agree.
-        joint: of these captures; the second camera is its base.
-        lenses: of each camera; None for exact ones.
+        joint: joint estimate of these captures; the second camera is its base.
+        lenses: lenses of each camera; None for exact ones.
         rejected: the other captures in which both see the pattern.
     """
 
@@ -54,9 +55,9 @@ def match_cameras(
     """Find the captures that agree on the pose of the second camera in the first one's frame.
 
     Args:
-        images: of both cameras by capture.
+        images: images of both cameras by capture.
         board: the board.
-        settings: of each camera; a lens there is used instead of a new one.
+        settings: settings of each camera; a lens there is used instead of a new one.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsics.
@@ -95,7 +96,7 @@ def _mean(observations: Sequence[Observation], board: Board) -> Start:
     """Average the relative poses of all captures, and predict each placement from the others."""
     T = np.array([o.pose.T_cam_board @ invert(o.surface.T_lidar_board) for o in observations])
     placement = group_poses(np.array([o.pose.T_cam_board for o in observations]))
-    # A rotation shifts boards that are far away more; their poses are as uncertain as near ones' here.
+    # A rotation shifts distant boards more. Here all poses have the same uncertainty, near or far.
     information = np.tile(np.diag(_TYPICAL**-2), (len(T), 1, 1))
 
     def average(keep: Array) -> Array:
@@ -113,5 +114,5 @@ def _mean(observations: Sequence[Observation], board: Board) -> Start:
             there = transform(T_others @ o.surface.T_lidar_board, corners)
             apart = there - transform(o.pose.T_cam_board, corners)
             held_out_m[k] = np.sqrt(np.mean(np.sum(apart**2, axis=1)))
-    # The mean pose is unique: its start needs no search.
+    # The mean pose is unique, so the start needs no global search.
     return Start(T_all, Certificate(True, 0.0), list(observations), {}, held_out_m, Diagnostics())

@@ -1,4 +1,4 @@
-"""Two LiDARs that saw the same boards: the captures that agree, and where the estimate of their pose starts.
+"""Two LiDARs that saw the same boards: agreeing captures, and the initial guess of the relative pose.
 
     place_boards      the boards' poses by each LiDAR alone, of maximum likelihood, with its constant errors
     find_consensus    the captures that agree on one rigid transform
@@ -36,15 +36,15 @@ from lce_rig.core.geometry import (
 )
 from lce_rig.core.results import BoardPose, LidarBoard, Observation
 
-# Plates whose sides differ by less than this share look the same turned by 90 deg.
+# Largest relative difference of a plate's sides at which a rotation by 90 deg is ambiguous.
 _NEARLY_SQUARE = 0.1
-# A board in the two scans may differ by so much about its normal; more is another thing of its size.
+# Largest rotation of the board about its normal between the scans, rad; above it, one shows another object.
 _MOST_TURN_RAD = np.radians(15.0)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedBoards:
-    """Poses of F boards by one LiDAR alone.
+    """Poses of F boards estimated from the scans of one LiDAR alone.
 
     Attributes:
         T: (F, 4, 4) T_lidar_board.
@@ -58,7 +58,7 @@ class PlacedBoards:
 
 
 class LidarPair(NamedTuple):
-    """Two LiDARs, in an optical frame of the first.
+    """Two LiDARs, relative to an optical frame of the first.
 
     Attributes:
         start: pose of the second by Algorithm 1, with the captures that agree.
@@ -78,12 +78,12 @@ class LidarPair(NamedTuple):
 
 
 def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateSettings) -> PlacedBoards:
-    """Estimate the poses of the boards in the scans of one LiDAR, for points as its driver gives them.
+    """Estimate the poses of the boards relative to the points that one LiDAR's driver reports.
 
     Args:
-        lidars: of F captures.
+        lidars: the board in the scans of F captures.
         board: the plate.
-        settings: what the profile says of this LiDAR.
+        settings: the profile's settings of this LiDAR.
     """
     joint = fit_boards(lidars, board, *what_is_known(settings))
     state, pose_of = joint.state, OWN["pose"]
@@ -108,7 +108,7 @@ def match_lidars(
         candidates: of each capture with the board in both scans; the first LiDAR's poses in its own frame.
         first: by capture the places in its scan where the board may be.
         board: the plate.
-        settings: what the profile says of each LiDAR.
+        settings: the profile's settings of each LiDAR.
 
     Raises:
         NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
@@ -123,7 +123,7 @@ def match_lidars(
     seen, refused, observations = {}, dict(consensus.refused), []
     for o in candidates:
         if o.capture in refused:
-            # Alone: another plate would bend the errors that all captures share.
+            # Estimate this LiDAR alone: another plate would distort the errors that all captures share.
             alone = place_boards([_board_of(o, first[o.capture])], board, settings[0])
             seen[o.capture] = _with_pose(o, T_view @ alone.T[0], R @ alone.cov[0] @ R.T)
     for o, T, cov in zip(agreed, one.T, one.cov, strict=True):
@@ -153,7 +153,7 @@ def match_lidars(
 
 
 def optical_frame(middles: Array) -> Array:
-    """Turn the axes of a LiDAR (x forward, z up) into a camera's (z forward, y down) that looks at boards.
+    """Rotate the axes of a LiDAR (x forward, z up) to a camera's (z forward, y down) facing the boards.
 
     Args:
         middles: (F, 3) of the boards, frame of the LiDAR.
@@ -169,7 +169,7 @@ def optical_frame(middles: Array) -> Array:
 
 
 def _board_of(observation: Observation, places: Sequence[LidarBoard]) -> LidarBoard:
-    """Choose the place in the first LiDAR's scan whose pose an observation has."""
+    """Choose the candidate in the first LiDAR's scan that an observation is based on."""
     middle = observation.pose.T_cam_board[:3, 3]
     return min(places, key=lambda each: float(np.linalg.norm(each.T_lidar_board[:3, 3] - middle)))
 
@@ -179,7 +179,7 @@ def _with_pose(observation: Observation, T: Array, cov: Array) -> Observation:
 
 
 def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
-    """Choose the turn (4, 4) about the plate's normal that brings a pose `other` next to T (4, 4).
+    """Choose the rotation (4, 4) about the plate's normal that brings pose `other` closest to T (4, 4).
 
     Returns:
         The turn, and the angle about the normal that is left, rad.

@@ -31,7 +31,7 @@ CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
 _N_REFINEMENTS = 10
 _MOVED_M = 0.1
-# Beyond this the image alone excludes the second pose, for any error of the camera model.
+# Above this, the image alone excludes the second pose, whatever the error of the camera model.
 _MAX_CHI2_GAP = 100.0
 
 
@@ -74,7 +74,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
 
     Args:
         candidates: of each capture, in any order, with all places in the scan where the board may be.
-        board: its size sets the scale at which an angle weighs as much as a distance.
+        board: the board's size sets the scale at which an angle weighs as much as a distance.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsics.
@@ -125,7 +125,7 @@ def agrees_with(item: Observation, T_cam_lidar: Array) -> bool:
 
 
 def open_poses(seen: BoardPose) -> list[Array]:
-    """List the poses (4, 4) of the board that the first sensor leaves open."""
+    """List the poses (4, 4) of the board that the first sensor cannot distinguish."""
     if seen.T_cam_board_alternative is None or seen.chi2_gap > _MAX_CHI2_GAP:
         return [seen.T_cam_board]
     return [seen.T_cam_board, seen.T_cam_board_alternative]
@@ -162,7 +162,7 @@ def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
         along.append(np.einsum("ijk,ik->ij", baseline, normals))
     agrees = np.abs(angles[0] - angles[1]) < NORMAL_TOLERANCE_RAD
     agrees &= np.abs(lengths[0] - lengths[1]) < CENTRE_TOLERANCE_M
-    # The height of one board over the other's plane also depends on the error of the angle between both
+    # The height of one board above the other's plane also depends on the error of the angle between the
     # planes.
     height_tolerance = CENTRE_TOLERANCE_M + np.maximum(*lengths) * np.sin(NORMAL_TOLERANCE_RAD)
     is_level = np.abs(along[0] - along[1]) < height_tolerance
@@ -200,7 +200,11 @@ def _misfit(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _score(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
-    """Sum over captures 1 - r^2 of their best pair where r < 1: scores (H,), and r^2 (H, P)."""
+    """Score hypotheses (H,) by the sum of max(0, 1 - r^2) of each capture's best pair.
+
+    Returns:
+        The scores (H,) and the squared normalised misfits r^2 of all pairs (H, P).
+    """
     angle, distance = _misfit(pairs, R, t)
     r2 = (angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2
     first = np.flatnonzero(np.r_[True, np.diff(pairs.capture) > 0])

@@ -1,4 +1,4 @@
-"""The method, from the boards that both sensors saw to extrinsics with their uncertainty.
+"""The whole method: from boards detected by both sensors to extrinsics with their uncertainty.
 
     fit_session_lens     the camera's intrinsics and the board's shape, from the images and the profile
     find_consensus       the captures of each channel that agree on one rigid transform
@@ -52,9 +52,9 @@ def estimate_extrinsics(
     Args:
         candidates: by channel, of each capture with detections of both sensors; channels whose captures agree
             on no extrinsics are skipped.
-        board: its specification.
+        board: the board's specification.
         settings: method, priors and tolerances.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
         progress: called at each step.
 
     Raises:
@@ -122,8 +122,8 @@ def fit_extrinsic(
     """Estimate T_cam_lidar from both sensors' detections of boards that stood still.
 
     Args:
-        candidates: of each capture with detections of both sensors, in any order.
-        board: its specification.
+        candidates: observations of each capture with detections of both sensors, in any order.
+        board: the board's specification.
         settings: method, priors and tolerances.
 
     Raises:
@@ -146,7 +146,7 @@ def estimate_observations(
 
     Args:
         observations: one per capture.
-        board: its specification.
+        board: the board's specification.
         settings: method, priors and tolerances.
         progress: called at each step.
 
@@ -168,7 +168,7 @@ def estimate_observations(
 def _with_session_lens(
     candidates: Mapping[str, Sequence[Observation]], board: Board, settings: EstimateSettings
 ) -> tuple[Mapping[str, Sequence[Observation]], EstimateSettings]:
-    """Fit the lens of a profile that is not exact, if it is not known yet, and the boards' poses with it."""
+    """Fit the session's lens, unless it is exact or known, and the boards' poses with it."""
     if settings.tolerances is None or settings.tolerances.lens.is_exact:
         return candidates, settings
     images = {name: [o.image for o in observations] for name, observations in candidates.items()}
@@ -180,7 +180,7 @@ def _with_session_lens(
 def _agree(
     candidates: Mapping[str, Sequence[Observation]], board: Board
 ) -> tuple[dict[str, Consensus], dict[str, float], tuple[Finding, ...]]:
-    """Find each channel's consensus and corner noise, px; the channel with the steadiest corners first.
+    """Find each channel's consensus and corner noise, px; the channel with the least noise comes first.
 
     Channels in which an error of association explains most captures are skipped; those of others are listed.
     """
@@ -204,7 +204,7 @@ def _agree(
             agreed[channel] = consensus
     if not agreed:
         raise troubles[0]
-    # Of each channel's corners per coordinate, from the residuals of all its boards.
+    # Corner noise per channel and coordinate, from the residuals of all boards.
     noise = {
         name: float(np.sqrt(np.mean([o.image.sigma_px**2 for o in consensus.observations])))
         for name, consensus in agreed.items()
@@ -217,7 +217,7 @@ def _before_geometry(
     candidates: Mapping[str, Sequence[Observation]],
     agreed: Mapping[str, Consensus],
 ) -> NotEnoughDataError:
-    """Name the disagreement of most captures instead of the few that agree and leave a direction open."""
+    """Report the disagreement of most captures rather than the weak geometry of the few that agree."""
     n_agreeing = sum(len(consensus.observations) for consensus in agreed.values())
     n_captures = sum(len(candidates[channel]) for channel in agreed)
     if error.finding is None or error.finding.code != UNDETERMINED.code or 2 * n_agreeing >= n_captures:
@@ -235,7 +235,7 @@ def _with_consensus(estimate: CalibrationEstimate, agreed: Sequence[Consensus]) 
 
 
 def _difference(motion: Motion, channels: Sequence[str], board: Board) -> PoseDifference | None:
-    """Compare two channels' extrinsics; None where only both together show how boards moved."""
+    """Compare the extrinsics of two channels; None if the boards' motion needs both channels."""
     if len(channels) != 2 or not motion.is_seen_by_each:
         return None
     first, second = (solve(motion.observations(channel), board) for channel in channels)

@@ -1,4 +1,4 @@
-"""Findings of the calibration: captures that disagree, and captures that are too few."""
+"""Findings of the calibration: captures that disagree, and too few captures."""
 
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import captures_to_add, fill
@@ -43,9 +43,9 @@ def _mirrored(finding: Finding) -> str:
 
 
 def _other_order(finding: Finding) -> str:
-    """Images are late, early or reversed ({order}): {n_explained} of {n_captures}, {n_agreeing} their own."""
+    """Images are late, early or reversed ({order}): {n_explained} of {n_captures}; {n_agreeing} unchanged."""
     return fill(
-        f"images are {_ORDERS[str(finding.figures['order'])]}, {{n_agreeing}} their own", finding.figures
+        f"images are {_ORDERS[str(finding.figures['order'])]}, {{n_agreeing}} unchanged", finding.figures
     )
 
 

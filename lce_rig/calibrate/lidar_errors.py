@@ -20,9 +20,10 @@ Errors found on two recorded sessions of one LiDAR (rlfs01, rlfs02) apart differ
 """
 
 
-# Prior standard deviation of an offset of all ranges that is looked for, m: first-generation OS1 reach 0.11.
+# Prior standard deviation of an unknown offset of all ranges, m: first-generation OS1 reach 0.11.
 _FREE_OFFSET_M = 0.2
-# Error of its estimate beyond the likelihood's, m: the scatter between sessions of one VLP-16 (rlfs01 to 03).
+# Error of the estimated offset not covered by the likelihood, m: scatter between sessions of one VLP-16
+# (rlfs01 to 03).
 _OFFSET_SCATTER_M = 0.003
 # Significance threshold of that offset, in its standard deviations.
 _SIGNIFICANT = 3.0
@@ -39,7 +40,7 @@ class LidarErrors:
         n_points: (K,) returns of each laser on boards.
         offset_m: constant error of all ranges, positive if too long; None if not significant.
             It is not part of the lasers' errors in `found`.
-        offset_sigma_m: of it.
+        offset_sigma_m: standard deviation of `offset_m`.
         has_lasers: whether the sessions determine the errors of single lasers, not only that offset.
     """
 
@@ -83,7 +84,7 @@ def estimate_lidar(
         for k, observations in enumerate(sessions)
     ]
     priors, usual = what_is_known(replace(options, known=None))
-    # An offset beyond the profile's is tested with next to no prior of its own.
+    # Test for an offset larger than the profile's with an almost flat prior.
     free = replace(priors, offset_m=_FREE_OFFSET_M, squares=scale_sigma or priors.squares)
     joint = maximise_likelihood(apart, board, T_cam_lidar, free, usual)
     offset_m, offset_sigma_m = _common_offset(joint)
@@ -94,7 +95,7 @@ def estimate_lidar(
     L = layout.n_rings
     cov, about_mean = joint.cost.covariance(), np.eye(L) - 1 / L
     sigma = np.sqrt([np.diag(about_mean @ cov[at[:, None], at] @ about_mean) for at in layout.lasers])
-    # Lasers that met few boards are known as well as without them.
+    # Lasers that hit few boards keep the uncertainty of their prior.
     prior = np.array([joint.levels.laser_m, joint.priors.azimuth_rad, joint.priors.elevation_rad])
     sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, prior[:, None]))
     lens = layout.z["lens"]

@@ -18,7 +18,7 @@ SAME_PLACE_M, SAME_TURN_RAD = 0.03, np.radians(3.0)
 
 @dataclass(frozen=True)
 class Clocks:
-    """The profile's settings of time.
+    """The profile's clock settings.
 
     Attributes:
         sweep_s: duration of a revolution.
@@ -73,7 +73,7 @@ class SharedScan:
 
     @property
     def capture(self) -> str:
-        """The capture that stands for all of them."""
+        """Name of the capture that represents all of them."""
         return self.captures[0]
 
     def observation(self, channel: str | None = None) -> Observation:
@@ -85,13 +85,13 @@ class SharedScan:
 def join_scans(
     agreed: Mapping[str, Sequence[Observation]], candidates: Mapping[str, Sequence[Observation]]
 ) -> tuple[list[SharedScan], dict[str, Refusal]]:
-    """Group the channels' observations by scan, in any captures.
+    """Group the channels' observations by scan, across captures.
 
     Recordings often hold the images of each channel in a folder of its own, with copies of the same scans.
 
     Args:
         agreed: observations of each channel that agree, the most trusted channel first.
-        candidates: of each channel, with all places that each scan offers.
+        candidates: observations of each channel, with all places that each scan offers.
 
     Returns:
         The scans by name, and refusals of images that match another surface of the scan than those of the
@@ -118,23 +118,23 @@ def join_scans(
 
 
 def scan_key(observation: Observation) -> bytes:
-    """Identify the board that the second sensor saw by its points."""
+    """Identify the board seen by the second sensor from its points."""
     return board_key(observation.surface)
 
 
 def board_key(surface: BoardSurface) -> bytes:
-    """Identify a board by the points on it."""
+    """Identify a board from the points on it."""
     return surface.points.tobytes()
 
 
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
-    """Number the board placements (F,) of captures by the first sensor's poses of the board."""
+    """Number the board placements (F,) of captures, from the board poses of the first sensor."""
     poses = np.array([observation.pose.T_cam_board for observation in observations])
     return group_poses(poses.reshape(-1, 4, 4))
 
 
 def group_poses(T: Array) -> NDArray[np.intp]:
-    """Number the board placements of captures; captures that stood in the same place share a number.
+    """Number the board placements of captures; captures at the same place share a number.
 
     A capture joins the first placement whose first capture has its centre and normal nearby.
 

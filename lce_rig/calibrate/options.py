@@ -22,9 +22,9 @@ class Tolerances:
     Attributes:
         lens: the intrinsics with theirs.
         square_size: relative.
-        pattern_offset_m: of each coordinate of the pattern's centre on the plate.
-        plate_m: of each side of the plate.
-        bow_m: of the middle's height over the ends, along the width and along the height.
+        pattern_offset_m: standard deviation of each coordinate of the pattern's centre on the plate.
+        plate_m: standard deviation of each side of the plate.
+        bow_m: standard deviation of the middle's height over the ends, along the width and along the height.
     """
 
     lens: LensPrior
@@ -60,7 +60,7 @@ class CalibrateOptions:
 
 @dataclass(frozen=True, eq=False)
 class KnownLidar:
-    """Constant errors of a LiDAR, measured before.
+    """Constant errors of a LiDAR, measured earlier.
 
     Attributes:
         rings: (K,) ring numbers.
@@ -78,7 +78,7 @@ class KnownLidar:
 
     @classmethod
     def of(cls, settings: LidarIntrinsicsSettings | None) -> "KnownLidar | None":
-        """Read a profile's block; None if there is none."""
+        """Read a profile's block; None if it is missing."""
         if settings is None:
             return None
         lasers = settings.lasers
@@ -105,8 +105,8 @@ class EstimateSettings(CalibrateOptions):
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
-        tolerances: of the profile's lens and board; None takes both as exact.
-        lens: of the session; None to fit it first, with tolerances.
+        tolerances: tolerances of the profile's lens and board; None takes both as exact.
+        lens: the session's lens; None to fit it first, with tolerances.
     """
 
     laser_bias_sigma_m: float = 0.0
@@ -120,7 +120,7 @@ class EstimateSettings(CalibrateOptions):
     def of(
         cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None
     ) -> "EstimateSettings":
-        """Add the profile's settings of a LiDAR, and of lens and board, to a user's options."""
+        """Combine a user's options with the profile's settings of a LiDAR, lens and board."""
         return cls(
             options.method,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,

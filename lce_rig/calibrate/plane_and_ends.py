@@ -31,7 +31,7 @@ BLENDS_M = 0.35
 _HALF_BEAM_M = 0.008  # of the beams that the priors of the shifts by the background are from
 BLENDS = 1
 """Column of `describe_background` that tells whether the background's echo blends into the board's."""
-# Least cosine of incidence (78 deg) for projection along rays, which multiplies errors by its inverse.
+# Smallest cosine of incidence (78 deg) for projection along rays, which divides errors by it.
 _GRAZING_COSINE = 0.2
 
 
@@ -40,8 +40,8 @@ class CaptureFeatures:
     """The fitted features of one capture.
 
     Attributes:
-        capture: its name.
-        board: its size.
+        capture: the capture's name.
+        board: the board's size.
         plane_points: (N, 3) frame lidar, m.
         edge_points: (M, 3) ring ends, frame lidar, m.
         lidar_normal: (3,) of the board, towards the LiDAR, frame lidar.
@@ -59,17 +59,17 @@ class CaptureFeatures:
 
     @property
     def normal(self) -> Array:
-        """(3,) of the board, towards the camera, frame camera."""
+        """Normal (3,) of the board, towards the camera, frame camera."""
         return self.T_cam_board[:3, 2]
 
     @property
     def centre(self) -> Array:
-        """(3,) of the plate, frame camera, m."""
+        """Centre (3,) of the plate, frame camera, m."""
         return self.T_cam_board[:3, 3]
 
     @property
     def cov_normal(self) -> Array:
-        """(3, 3) of `normal`.
+        """Covariance (3, 3) of `normal`.
 
         With R = exp(phi^) R0 it moves by phi x n = -n^ phi, hence cov_n = n^ cov_phi n^T (the paper's
         equation for the left perturbation).
@@ -79,7 +79,7 @@ class CaptureFeatures:
 
     @property
     def edge_normals(self) -> Array:
-        """(4, 3) outwards in the board's plane, frame camera."""
+        """Edge normals (4, 3), outwards in the board's plane, frame camera."""
         return np.asarray(self.board.edges()[1] @ self.T_cam_board[:3, :3].T)
 
     def board_rows(self, points: Array) -> Array:
@@ -101,7 +101,7 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
 
     Args:
         observation: the boards of both sensors.
-        board: its size.
+        board: the board's size.
         half_step: move ring ends outwards by half an azimuth step, to where the edge is expected: the edge
             lies between the last ray that met the board and the next one. Without it, they are as measured.
     """
@@ -136,7 +136,7 @@ def _meet_plane(points: Array, plane: Array) -> Array:
 
 
 def turn_about_z(vectors: Array, angle_rad: Array) -> Array:
-    """Turn vectors (M, 3) about the z axis by angles (M,)."""
+    """Rotate vectors (M, 3) about the z axis by angles (M,)."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     x = cosine * vectors[:, 0] - sine * vectors[:, 1]
     y = sine * vectors[:, 0] + cosine * vectors[:, 1]
@@ -161,7 +161,7 @@ def plane_residuals(f: CaptureFeatures, T_cam_lidar: Array, points: Array | None
     """Evaluate (1) for the points (N, 3) of a capture, by default its plane points: (..., N).
 
     Args:
-        f: of the capture.
+        f: index of the capture.
         T_cam_lidar: (..., 4, 4).
         points: other points of the board, frame lidar.
     """
@@ -173,7 +173,7 @@ def end_residuals(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, NDArra
     """Evaluate (2) without shift for a capture's ring ends and their nearest edges.
 
     Args:
-        f: of the capture.
+        f: index of the capture.
         T_cam_lidar: (..., 4, 4).
 
     Returns:
@@ -185,13 +185,13 @@ def end_residuals(f: CaptureFeatures, T_cam_lidar: Array) -> tuple[Array, NDArra
 
 
 def distance_inside(board: Board, xy_m: Array, edge: NDArray[np.intp]) -> Array:
-    """Measure how far points (..., 2 or 3) of the board's plane lie inside edges (...) by number: (...)."""
+    """Compute the distance of points (..., 2 or 3) in the board's plane inside given edges: (...)."""
     anchors, normals = (of_edges[edge, :2] for of_edges in board.edges())
     return np.asarray(np.sum((anchors - xy_m[..., :2]) * normals, axis=-1))
 
 
 def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:
-    """Take a capture's ring ends to the frame of the board that the camera sees: (..., M, 3)."""
+    """Transform a capture's ring ends to the frame of the camera's board: (..., M, 3)."""
     return transform(invert(f.T_cam_board) @ T_cam_lidar, f.edge_points)
 
 

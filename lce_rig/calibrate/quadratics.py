@@ -1,4 +1,4 @@
-"""A cost to second order per capture, which gives the result of any subset of the captures.
+"""Second-order cost per capture, from which the result of any subset of captures follows.
 
 With half the gradient g_k and half the Hessian H_k of each capture's cost, and P and g_P those of the priors,
 the optimum for weights w of the captures is
@@ -21,7 +21,7 @@ from lce_rig.core.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Quadratics:
-    """F captures' costs about some values of p unknowns.
+    """Costs of F captures, expanded about some values of p unknowns.
 
     Attributes:
         gradients: (F, p) g_k.
@@ -39,17 +39,17 @@ class Quadratics:
 
     @cached_property
     def groups(self) -> Array:
-        """(G, F): 1 where a capture shows a placement."""
+        """Incidence matrix (G, F): 1 where a capture shows a placement."""
         numbers = np.arange(int(self.placement.max()) + 1)
         return np.asarray(numbers[:, None] == self.placement, dtype=np.float64)
 
     @cached_property
     def information(self) -> Array:
-        """(p, p) of all captures and priors."""
+        """Information (p, p) of all captures and priors."""
         return np.asarray(self.hessians.sum(axis=0) + self.prior)
 
     def solve(self, shares: Array) -> Array:
-        """Compute (1) for B shares (B, F): unknowns (B, p)."""
+        """Compute (1) for B weightings (B, F) of the captures: unknowns (B, p)."""
         H = np.tensordot(shares, self.hessians, axes=1) + self.prior
         g = shares @ self.gradients + self.prior_gradient
         return np.asarray(-(symmetric_inverse(H) @ g[..., None])[..., 0])
@@ -70,7 +70,7 @@ class Quadratics:
         return np.asarray((symmetric_inverse(H) @ (self.groups @ self.gradients)[..., None])[..., 0])
 
     def covariance(self) -> Array:
-        """Compute the covariance (p, p) of all captures' unknowns if every error is independent."""
+        """Compute the covariance (p, p) of the unknowns from all captures, for independent errors."""
         return symmetric_inverse(self.information)
 
     def jackknife_covariance(self) -> Array:

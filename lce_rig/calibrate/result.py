@@ -21,7 +21,7 @@ BY_ALGORITHM_1 = "algorithm_1"
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Effect of an error of the profile on the extrinsics, used with the result's intrinsics.
+    """Effect of a profile error on the extrinsics when used with the result's intrinsics.
 
     Or the moves that would resolve a check's contradiction: the covariance holds both sides.
 
@@ -36,17 +36,17 @@ class Sensitivity:
     moves: Array
 
     def covariance(self) -> Array:
-        """Compute the covariance (6, 6) for the source's standard deviation."""
+        """Compute the covariance (6, 6) for the standard deviation of this source."""
         return np.asarray(self.sigma**2 * self.moves.T @ self.moves)
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A solution of the captures that agree, from which an estimate begins.
+    """Initial guess of an estimate: a solution of the captures that agree.
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        certificate: of Algorithm 1's final cost over all captures used.
+        certificate: certificate of Algorithm 1's final cost over all captures used.
         observations: the F captures used, as measured, sorted by name.
         refused: why each other capture is not used.
         held_out_m: (F,) error of each capture in the fits without it.
@@ -86,7 +86,7 @@ class CalibrationEstimate:
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
-        channels: of the camera, with the time offset of each; empty if they were not separated.
+        channels: channels of the camera, with the time offset of each; empty if they were not separated.
         channel_difference: of the extrinsics of two channels; None if they cannot be compared.
         association: errors by which images and scans of some captures do not belong together.
     """
@@ -122,13 +122,13 @@ class CalibrationEstimate:
 
     @property
     def as_start(self) -> Start:
-        """The solution from which another estimate of the same captures begins."""
+        """Return the solution as initial guess for another estimate from the same captures."""
         held_out_m = np.array([residual.held_out_m for residual in self.residuals])
         seen = list(self.observations.values())
         return Start(self.T_cam_lidar, self.certificate, seen, self.refused, held_out_m, self.diagnostics)
 
     def captures_of(self, names: Iterable[str]) -> set[str]:
-        """Name every capture that holds the scan of one of the captures named."""
+        """Name every capture that contains the scan of one of the named captures."""
         return {capture for name in names for capture in self.same_scan.get(name, (name,))}
 
 
@@ -175,19 +175,19 @@ def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagn
 
 
 def lever_arm(observations: Sequence[Observation]) -> float:
-    """Compute the rms distance of the boards from the first sensor, m: displacement by a turn of 1 rad."""
+    """Compute the rms distance of the boards from the first sensor, m: displacement per rad of rotation."""
     centres = [observation.pose.T_cam_board[:3, 3] for observation in observations]
     return float(np.sqrt(np.mean([centre @ centre for centre in centres])))
 
 
 def squares_scale(diagnostics: Diagnostics) -> float:
-    """Compute the size of the board's squares by profile and LiDAR, relative to the profile's."""
+    """Compute the size of the board's squares from profile and LiDAR, relative to the profile's."""
     scale = diagnostics.camera_scale
     return 2.0 - scale if np.isfinite(scale) else 1.0
 
 
 def with_squares(observation: Observation, squares: float) -> Observation:
-    """Move the first sensor's board to the distance that squares of `squares` times the size mean."""
+    """Move the first sensor's board to the distance expected for squares of `squares` times the size."""
     T_cam_board = observation.pose.T_cam_board.copy()
     T_cam_board[:3, 3] *= squares
     return replace(observation, pose=replace(observation.pose, T_cam_board=T_cam_board))
@@ -208,7 +208,7 @@ def capture_residual(
     Args:
         T_cam_lidar: (4, 4).
         observation: the boards of both sensors.
-        board: its size.
+        board: the board's size.
         held_out_m: passed through.
         squares: size of the squares relative to that by which the image's board was posed.
     """
@@ -230,7 +230,7 @@ def capture_residual(
 
 def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
     """Average per-capture residuals: MPE, MEE (mean distances) and the rms corner residual."""
-    # A scan may show the board without any usable end of a ring.
+    # A scan may show the board without any usable ring end.
     edges = np.array([r.edge_mean_m for r in residuals])
     return Metrics(
         mpe_m=_mean(np.array([r.plane_mean_m for r in residuals])),

@@ -1,4 +1,4 @@
-"""All sensors of a rig estimated as one, from estimates of pairs of them.
+"""Joint estimate of all sensors of a rig, from estimates of pairs of sensors.
 
 Pairs say which captures agree, where the estimate starts, and how large the noise is. In one likelihood each
 sensor has one pose, so that loops of poses close, and what one LiDAR's errors or the board's do to one pair
@@ -65,13 +65,13 @@ class RigResult:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What two sensors saw in a capture.
+    """Observations of two sensors in one capture.
 
     Attributes:
         pair: the sensors.
-        capture: its name.
+        capture: the capture's name.
         boards: in the scan of each LiDAR.
-        image: of the camera; None for two LiDARs.
+        image: image of the camera; None for two LiDARs.
     """
 
     pair: SensorPair
@@ -93,7 +93,7 @@ def estimate_rig(
     Args:
         cameras: estimates by the likelihood of cameras and LiDARs whose boards stood still.
         between: pairs of LiDARs, and of cameras. All pairs together connect all sensors.
-        board: its specification.
+        board: the board's specification.
         lidars: names in the order of the profile.
     """
     held = {name for pair in (*cameras, *between) for name in pair}
@@ -174,11 +174,11 @@ def estimate_rig(
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """Boards and images of n placements in time: captures that hold the same scan are one.
+    """Boards and images of n placements in time: captures with the same scan are merged.
 
     Attributes:
-        n: how many.
-        of_capture: number of each capture's.
+        n: number of placements.
+        of_capture: placement number by capture name.
         boards: by LiDAR and number.
         images: by camera and number.
     """
@@ -212,7 +212,7 @@ class _Frames:
         return stack_images(np.array(frames), found, board.pattern_offset_m, lens)
 
     def stack_scans(self, base: str, board: Board) -> StackedScans:
-        """Stack a LiDAR's scans; those of a camera that is the base have no returns."""
+        """Stack a LiDAR's scans; for a camera as the base they have no returns."""
         boards = self.boards.get(base)
         if not boards:
             return no_scans(self.n)
@@ -221,7 +221,7 @@ class _Frames:
         return spread(stack_scans(found, board), np.array(frames), self.n)
 
     def place(self, T_start: Mapping[str, Array]) -> Array:
-        """Place the boards: T_base_board (n, 4, 4), by a camera where one saw it.
+        """Place the boards: T_base_board (n, 4, 4), from a camera if one saw the board.
 
         Args:
             T_start: T_sensor_base (4, 4) of each sensor.
@@ -273,7 +273,7 @@ def _report(
 
 
 class _Known(NamedTuple):
-    """A camera by the pair that tells most of it: lens, and errors of its images by level."""
+    """A camera's lens and image errors by level, from its most informative pair."""
 
     lens: SessionLens | None
     levels: Mapping[str, float]
@@ -284,7 +284,7 @@ def _known_of(
     cameras: Mapping[SensorPair, CalibrationEstimate],
     between: Mapping[SensorPair, LidarPair | StereoPair],
 ) -> _Known:
-    """Choose the pair of a camera with the most captures, one with a LiDAR if there is any."""
+    """Choose the pair of a camera with the most captures, preferably one with a LiDAR."""
     of_lidars = [e for pair, e in cameras.items() if camera in pair]
     if of_lidars:
         main = max(of_lidars, key=lambda e: len(e.used))
@@ -307,7 +307,7 @@ def _donor(
     cameras: Mapping[SensorPair, CalibrationEstimate],
     between: Mapping[SensorPair, LidarPair | StereoPair],
 ) -> JointEstimate:
-    """Choose the estimate of a pair that tells most of a LiDAR's errors and noise, or of a base camera's."""
+    """Choose the most informative pair for a LiDAR's, or a base camera's, errors and noise."""
     found = [(len(e.used), e.joint[0]) for (_, name), e in cameras.items() if name == base and e.joint]
     if found:
         return max(found, key=lambda each: each[0])[1]
@@ -324,7 +324,7 @@ def _list_seen(
     between: Mapping[SensorPair, LidarPair | StereoPair],
     lenses: Mapping[str, SessionLens | None],
 ) -> Iterator[_Seen]:
-    """List what each pair saw in the captures that it uses, images with the lens of all."""
+    """List the observations of each pair in the captures it uses, all with the common lens."""
     for pair, estimate in sorted(cameras.items(), key=lambda each: each[0]):
         observations: Sequence[Observation] = list(estimate.observations.values())
         lens = lenses[pair[0]]
@@ -373,7 +373,7 @@ def _conflicts(seen: Sequence[_Seen]) -> dict[str, Refusal]:
 
 
 def _number_frames(seen: Sequence[_Seen]) -> dict[str, int]:
-    """Number captures from 0; those that hold the same scan of a LiDAR share a number."""
+    """Number captures from 0; captures with the same LiDAR scan share a number."""
     same: dict[str, str] = {}
 
     def root(name: str) -> str:
@@ -419,7 +419,7 @@ def _spanning_poses(
 def _weigh_cameras(
     stacked: Sequence[StackedImages], known: Sequence[_Known]
 ) -> tuple[list[StackedImages], dict[str, float]]:
-    """Give each camera's images their own errors: the images, and the levels, geometric means of all."""
+    """Assign each camera's own image errors: the images, and levels as geometric means over all cameras."""
     if not known:
         return [], {}
     logs = np.log([[each.levels[name] for name in OF_IMAGES] for each in known])
@@ -432,7 +432,7 @@ def _weigh_cameras(
 
 
 def _without(conflicts: Mapping[str, Refusal], own: Start, same_scan: Mapping[str, tuple[str, ...]]) -> Start:
-    """Remove captures with conflicts, and those that hold the same scan, from a pair's own."""
+    """Remove captures with conflicts, and captures with the same scan, from a pair."""
     held = [same_scan.get(o.capture, (o.capture,)) for o in own.observations]
     kept = [k for k, names in enumerate(held) if not conflicts.keys() & names]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*held)}

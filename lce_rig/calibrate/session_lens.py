@@ -1,4 +1,4 @@
-"""The session's lens: the profile's intrinsics and the boards in the images, weighed by their information.
+"""The session's lens: the profile's intrinsics and the boards in the images, weighted by information.
 
 The LiDAR has no part in it. Its constant errors, a turn about the vertical of 0.1 to 0.2 deg in recordings,
 look like a shift of the principal point, and would move a lens that it may move. Lens and shape of the board
@@ -28,7 +28,7 @@ from lce_rig.lens.fit import fit_poses, pose_moves
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import LensPrior, model_of
 
-# More images hardly improve a lens, and take time.
+# Maximum number of images: more hardly improve a lens and take time.
 _MAX_VIEWS = 80
 # Typical noise of a pose, m and rad; errors below this fraction of it, over all images, are negligible.
 _NOISE = np.repeat([1e-3, 5e-4], 3)
@@ -40,7 +40,7 @@ class SessionLens:
     """A camera's intrinsics and the board's shape, from the profile and the session's images.
 
     Attributes:
-        estimate: of both.
+        estimate: estimate of both.
         prior: the profile's.
     """
 
@@ -87,12 +87,12 @@ class SessionLens:
         return np.moveaxis(np.tensordot(axes, moves, axes=1), 0, -1), of_lens, by_lens @ of_lens.T
 
     def refit(self, observations: Sequence[Observation]) -> list[Observation]:
-        """Fit the poses in the images of observations anew with this lens and board."""
+        """Refit the board poses in the images of observations with this lens and board."""
         images = self.refit_images([each.image for each in observations])
         return [replace(each, pose=image) for each, image in zip(observations, images, strict=True)]
 
     def refit_images(self, boards: Sequence[ImageBoard]) -> list[ImageBoard]:
-        """Fit the poses of boards anew with this lens and board."""
+        """Refit the poses of boards with this lens and board."""
         corners_px = np.array([board.corners_px for board in boards])
         F, n = len(boards), np.isfinite(corners_px[..., 0]).sum(axis=1)
         has_other = np.array([board.T_cam_board_alternative is not None for board in boards])
@@ -101,7 +101,7 @@ class SessionLens:
             other = board.T_cam_board_alternative
             starts.append(board.T_cam_board if other is None else other)
         fitted = fit_poses(self.estimate, np.concatenate([corners_px, corners_px]), np.array(starts))
-        # Of both minima of each board, the lower one first.
+        # Sort the two minima of each board by cost.
         order = np.argsort(fitted[1].reshape(2, F), axis=0, kind="stable")
         (T, T_other), (cost, cost_other), (H, _) = (
             values.reshape(2, F, *values.shape[1:])[order, np.arange(F)] for values in fitted
@@ -109,7 +109,7 @@ class SessionLens:
         variance = np.maximum(cost / np.maximum(2 * n - 6, 1), 1e-12)
         gap = np.where(has_other, (cost_other - cost) / variance, np.inf)
         cov = variance[:, None, None] * np.linalg.inv(H)
-        # Poses in the images shortly before and after move by the same tangent.
+        # Shift the poses in the images shortly before and after by the same tangent.
         moved = difference(T, np.array([board.T_cam_board for board in boards]))
         tracks = [
             None if board.track_T_cam_board is None else perturb(board.track_T_cam_board, tangent)
@@ -137,7 +137,7 @@ def fit_session_lens(
 
     Args:
         images: by channel, of each capture.
-        board: its specification.
+        board: the board's specification.
         prior: the profile's intrinsics.
 
     Raises:
@@ -146,7 +146,7 @@ def fit_session_lens(
     every = [(channel, image) for channel, of_channel in images.items() for image in of_channel]
     thinned = every[:: max(1, -(-len(every) // _MAX_VIEWS))]
     placement = group_poses(np.array([image.T_cam_board for _, image in thinned]).reshape(-1, 4, 4))
-    # Images of one placement share its errors.
+    # Images of one placement share their errors.
     views = [
         BoardView(f"{number:06d}", channel, image)
         for number, (channel, image) in zip(placement.tolist(), thinned, strict=True)

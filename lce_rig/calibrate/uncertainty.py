@@ -1,4 +1,4 @@
-"""Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
+"""Uncertainty of a solution: covariance, its leave-one-out check, and errors of the profile."""
 
 import math
 from dataclasses import replace
@@ -28,7 +28,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
 from lce_rig.core.geometry import Array, difference
 
-# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
+# Significance threshold of (ratio of covariances - 1), in its standard deviations.
 _SURE = 2.0
 
 
@@ -67,10 +67,10 @@ def by_likelihood(
 
     Args:
         start: Algorithm 1's solution.
-        joint: of F captures.
-        board: its specification.
-        lens: of the camera; None if exact.
-        camera: its number.
+        joint: joint estimate of F captures.
+        board: the board's specification.
+        lens: intrinsics of the camera; None if exact.
+        camera: index of the camera.
     """
     moves = joint.cost.moves() @ joint.to_extrinsics[camera].T
     n_placements = len(np.unique(joint.placement[joint.terms.images[camera].capture]))
@@ -99,10 +99,10 @@ def with_errors(
 
     Args:
         start: figures of Algorithm 1.
-        levels: of the noise.
-        state: of the LiDAR; with cameras, also of the squares.
+        levels: noise levels.
+        state: state of the LiDAR; with cameras, also of the squares.
         edge_shift_sigma_m: standard deviation of the edge shift.
-        inflation: of the covariance.
+        inflation: inflation factor of the covariance.
     """
     shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
     return replace(
@@ -128,11 +128,11 @@ def with_errors(
 def with_corrected_planes(
     estimate: CalibrationEstimate, board: Board, rings: NDArray[np.int16], state: State
 ) -> CalibrationEstimate:
-    """Add the mean plane error of the points without the LiDAR's estimated constant errors.
+    """Add the mean plane error of the points after correction of the LiDAR's estimated constant errors.
 
     Args:
-        estimate: of a camera and a LiDAR.
-        board: its size.
+        estimate: estimate of a camera and a LiDAR.
+        board: the board's size.
         rings: (L,) ring numbers of the state's lasers.
         state: the errors.
     """
@@ -153,7 +153,7 @@ def without_lidar(figures: Diagnostics) -> Diagnostics:
 
 
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
-    """Multiply a covariance (6, 6) where the spread (6, 6) over placements significantly exceeds it.
+    """Scale a covariance (6, 6) up where the scatter (6, 6) between placements significantly exceeds it.
 
     The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
     noise model. If it exceeds the model's covariance, there are errors that the model lacks.
@@ -162,7 +162,7 @@ def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
         The covariance and the factor, 1 if they agree.
     """
     ratio = float(np.trace(symmetric_inverse(cov) @ spread)) / len(cov)
-    # A mean of 6 chi squares over n - 1 freedoms each.
+    # Standard deviation of a mean of 6 chi-squared values with n - 1 degrees of freedom each.
     chance = np.sqrt(2 / (len(cov) * max(n_placements - 1, 1)))
     factor = ratio if ratio > 1 + _SURE * chance else 1.0
     return factor * cov, factor

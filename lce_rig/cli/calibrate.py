@@ -44,7 +44,7 @@ _CORRECTED = {
     "verdict.laser_angles",
     "verdict.plate_size",
 }
-# Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
+# Number of reasons printed without --explain, and distance of the point with printed uncertainty, m.
 _N_REASONS, _FAR_M = 3, 10.0
 
 
@@ -56,7 +56,7 @@ def residual_words(metrics: Metrics, c: Calibration) -> str:
 
 
 def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
-    """State the standard deviations, by axis if the result passes, and for a point at a distance."""
+    """State the standard deviations, per axis if the result passes, and for a distant point."""
     yield f"  uncertainty  {sizes(c.sigma_rotation_deg, c.sigma_translation_m)} (1 sigma)"
     if c.verdict == "fail":
         return
@@ -212,7 +212,7 @@ def calibrate(
             show.warn(f"{finding.text}: {finding.advice_at(str(session))}")
     if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
         show.warn(f"{reference} has no T_cam_lidar for these sensors")
-    # The result is on the disk and on the screen before its report is drawn, which takes about as long.
+    # Write and print the result before drawing the report, which takes about as long.
     written = result.write(name=name, force=force, report=False)
     if as_json:
         show.print_json(result.document())
@@ -287,7 +287,7 @@ def _calibrate_scene(
 
 
 def collect_command(session: lce.Session) -> str:
-    """Write the command that adds captures to a session, with the source of its present ones."""
+    """Build the command that adds captures to a session from its present source."""
     from lce_rig.cli.simulate import TRUTH
 
     options = " --from RECORDING"
@@ -302,11 +302,11 @@ def collect_command(session: lce.Session) -> str:
 
 
 def _take_profile(path: Path, profile: str) -> None:
-    """Give a session another profile of its rig, and say where the earlier one is.
+    """Replace a session's profile and print where the earlier one is kept.
 
     Raises:
-        ProfileError: it is not a valid profile.
-        SessionError: it is of another rig.
+        ProfileError: the new profile is not valid.
+        SessionError: the new profile describes another rig.
     """
     rig = lce.load_rig(profile)
     with lce.Session.open(path, writable=True) as session:
@@ -323,7 +323,7 @@ def _lacking(
 
     Args:
         wanted: cameras that should have extrinsics.
-        cameras: of which the session holds captures.
+        cameras: cameras of which the session holds captures.
         calibrations: the results, at least one.
     """
     calibrated = {name for c in calibrations for name in (c.camera, c.lidar)}
@@ -358,9 +358,9 @@ def show_result(
 
     Args:
         pairs: the result.
-        poses: of its sensors; None for two.
+        poses: poses of its sensors; None for two.
         rig: the profile.
-        path: of the session.
+        path: path of the session.
         is_explained: whether to print everything that was estimated and tested.
     """
     told: dict[str, str] = {}
@@ -388,11 +388,11 @@ def _rig_parts(
 def _parts(
     c: Calibration, path: str, told: dict[str, str], *, is_explained: bool, is_of_rig: bool
 ) -> Iterator[Any]:
-    """Print the verdict, its reasons, the extrinsics and their uncertainty; explained, every test.
+    """Print the verdict, reasons, extrinsics and uncertainty; if explained, also every test.
 
     Args:
         c: the result of a pair.
-        path: of the session.
+        path: path of the session.
         told: pair by printed reason; this pair's reasons are added.
         is_explained: whether to print every figure.
         is_of_rig: whether a list of all sensors follows, which has the poses.
@@ -405,7 +405,7 @@ def _parts(
     used = f"{len(c.captures_used)} of {c.n_captures} {'captures' if c.is_with_board else 'views'} used"
     yield f"[bold]{pair}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
-    # A line counts those that are not shown.
+    # Print one line with the number of reasons not shown.
     n_shown = _N_REASONS if len(fresh) <= _N_REASONS else _N_REASONS - 1
     advised: set[str] = set()
     if earlier and not is_explained:
@@ -432,7 +432,7 @@ def _parts(
         yield show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
         yield from show.matrix_lines(c.T_cam_lidar, "    ")
     yield from _uncertainty(c, is_by_axis=is_explained or not is_of_rig)
-    # Lens and squares that the result has corrected go with its extrinsics.
+    # Print the corrected lens and square size, which belong to the extrinsics.
     corrected = [each for each in c.findings if each.code in _CORRECTED and each.severity == "note"]
     if corrected and c.verdict == "pass" and not is_explained:
         yield f"  {show.escape(corrected[0].text)}"

@@ -109,7 +109,7 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
 
 
 def _record(pose: PoseDetection, surfaces: SurfaceDetection, refusal: Refusal | None) -> dict[str, Any]:
-    """Describe a capture for programs; figures that were not measured are null."""
+    """Describe a capture for JSON output; unmeasured figures are null."""
 
     def figures(detected: BoardPose | BoardSurface | Refusal) -> dict[str, float | None] | None:
         if isinstance(detected, Refusal):
@@ -191,10 +191,10 @@ def _causes(
     *,
     is_whole: bool,
 ) -> list[str]:
-    """List refused captures, those with one cause and action together; a cause of the whole session first.
+    """List refused captures, grouped by cause and action; causes of the whole session come first.
 
     Args:
-        names: of all captures.
+        names: names of all captures.
         refused: by name.
         plates: findings about the plate's size in all scans.
         session: path, for the commands of actions.
@@ -225,7 +225,7 @@ def _causes(
     return lines
 
 
-# Captures that are refused for one cause with different figures; of more, those of the first stand for all.
+# Maximum number of captures listed individually per cause; beyond it the first one represents all.
 _MOST_LISTED = 4
 
 

@@ -38,13 +38,13 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     return topics
 
 
-# --preview's address where another word follows it: this computer alone.
+# Address of --preview if none is given: this computer only.
 _PREVIEW_DEFAULT = f"{LOOPBACK}:{DEFAULT_PORT}"
 _PREVIEW_ADDRESS = re.compile(r"[^/\s]*:\d*|\d+|\d+(\.\d+){3}|localhost")
 
 
 class _Command(click.Command):
-    """`--preview session/` is the option without an address, and the session."""
+    """Let `--preview session/` mean the option without an address, followed by the session."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Give --preview its default address if no address follows it."""
@@ -224,7 +224,7 @@ def collect(
 
 
 def _keep_text(session: Path, rig_name: str | None) -> None:
-    """Keep the profile's comments in the session, for the profiles that are made from it."""
+    """Keep the profile's comments in the session, for profiles derived from it."""
     if rig_name is not None and (session / MARKER).exists():
         Session.open(session).keep_text(read_profile(find_profile(rig_name)))
 
@@ -236,7 +236,7 @@ _OF_RECORDINGS = ("topics", "cameras", "channels", "lidars")
 def _one_for_each(
     paths: Sequence[Path], option: str, names: Sequence[str], sensors_of_rig: Collection[str] | None = None
 ) -> list[str | None]:
-    """Return the sensor name for each recording: the only one given, its own, or None.
+    """Return the sensor name of each recording: the only one given, its own, or None.
 
     Raises:
         UsageError: the number of names is neither one nor that of the recordings, or a name is unknown.
@@ -254,7 +254,7 @@ def _one_for_each(
 
 
 def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
-    """Refuse options that do not apply here, instead of ignoring them.
+    """Reject options that do not apply here instead of ignoring them.
 
     Raises:
         UsageError: one was given; the message names it.

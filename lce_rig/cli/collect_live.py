@@ -56,7 +56,7 @@ def run_live(
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
     require_kind(path, (seed or 0) if simulated else None)
     with ExitStack() as stack:
-        # The page first: an address that cannot be served fails before anything is created or started.
+        # Open the page first: an invalid address fails before anything is created or started.
         page = None if preview is None else _open_page(stack, preview)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
@@ -108,7 +108,7 @@ def run_live(
 
 
 def _until_gone(show_state: Callable[[LiveState], None]) -> Callable[[LiveState], None]:
-    """Show states until the terminal is gone; its hangup then ends the collection in good order."""
+    """Show states until the terminal closes; its hangup then ends the collection cleanly."""
     is_gone = threading.Event()
 
     def tell(state: LiveState) -> None:
@@ -123,7 +123,7 @@ def _until_gone(show_state: Callable[[LiveState], None]) -> Callable[[LiveState]
 
 @contextmanager
 def _session(path: Path, rig: Rig) -> Iterator[Session]:
-    """Continue or start a session; delete a new one that stays empty because its rig does not answer."""
+    """Continue or start a session; delete a new session that stays empty because its rig does not respond."""
     is_new = not path.exists()
     try:
         with Session.resume(path, rig) as session:
@@ -196,7 +196,7 @@ def _tell(
 
 
 def show_next(path: Path, rig: Rig, predicted: Sequence[Finding], n_captures: int) -> None:
-    """State whether the target is predicted to be met, by which figures, and the next command."""
+    """State whether the target is predicted to be met, the figures, and the next command."""
     are_enough = n_captures >= rig.quality.min_captures
     for prediction in predicted:
         state = "target met" if are_enough and is_met(prediction) else "target not met"

@@ -68,7 +68,7 @@ def captures(
         show.print_json({"format_version": 1, "rig": opened.rig.name, "captures": records})
     else:
         rows = []
-        # Captures in succession that differ by their name alone stand in one row.
+        # Successive captures that differ only in name share a row.
         for _, alike in groupby(records, lambda record: [record[key] for key in record if key != "name"]):
             record, *others = alike
             rows.append(
@@ -89,7 +89,7 @@ def captures(
 
 
 def put_aside(session: Path, names: Sequence[str], reason: str) -> None:
-    """Reject captures by name; those that are rejected already stay so.
+    """Reject captures by name; rejected ones stay rejected.
 
     Raises:
         UsageError: a name is not that of a capture. Then none is rejected.
@@ -102,7 +102,7 @@ def put_aside(session: Path, names: Sequence[str], reason: str) -> None:
 
 
 def _full(names: Iterable[str]) -> set[str]:
-    """Give captures' names with their leading zeros, which may be omitted."""
+    """Complete captures' names with their leading zeros, which may be omitted."""
     stripped = map(str.strip, names)
     return {name.zfill(6) if name.isascii() and name.isdigit() else name for name in stripped}
 
@@ -205,7 +205,7 @@ def _pair(c: Calibration) -> dict[str, Any]:
 
 
 def _rows(result: StoredResult) -> Iterator[tuple[str, ...]]:
-    """List the sensors of a result, or that it cannot be read."""
+    """List the sensors of a result, or state that it cannot be read."""
     name = show.escape(result.name)
     if result.file is None:
         yield name, "[red]unreadable[/]"
@@ -279,7 +279,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
 
 
 def _agreement(c: Repeatability, session: str) -> Iterator[str]:
-    """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
+    """State whether the sessions agree, the mean extrinsics, and the actual and the reported spread."""
     shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
     yield f"[{colour}]{show.escape(c.finding.text)}[/]"

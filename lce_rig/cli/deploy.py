@@ -1,4 +1,4 @@
-"""`lce-rig deploy`: put a result on a robot, show the deployed one, or go back."""
+"""`lce-rig deploy`: put a result on a robot, show the deployed one, or roll back."""
 
 import shlex
 from collections.abc import Callable
@@ -28,14 +28,14 @@ from lce_rig.pipeline.result_files import result_folder, with_profile_of
     "Read targets from this file [default: deploy.yaml beside SESSION].",
 )
 @result_option("Deploy")
-@click.option("--robot", metavar="NAME", help="Name the robot, for a target that stands for many.")
+@click.option("--robot", metavar="NAME", help="Name the robot, for a target shared by several robots.")
 @click.option("--dry-run", is_flag=True, help="Print the changes; change nothing.")
 @click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print the releases at the target; change nothing.")
-@click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
+@click.option("--rollback", is_flag=True, help="Restore the files of the previous release.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
 @click.option("--force", is_flag=True, help="Deploy against objections; requires --reason.")
-@click.option("--reason", default="", metavar="TEXT", help="Say why; it is written down at the target.")
+@click.option("--reason", default="", metavar="TEXT", help="State the reason; it is logged at the target.")
 @json_option
 def deploy(
     session: Path,
@@ -146,7 +146,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
 
 
 def _print_changes(plan: Plan, say: Callable[[str], None]) -> None:
-    """Print a line of each sensor: its movement, and its verdict where that changes."""
+    """Print each sensor's movement on a line, and its verdict if that changes."""
     for change in () if plan.is_in_place else plan.sensors:
         how = "new" if change.is_new else "removed"
         if change.rotation_deg is not None and change.translation_m is not None:

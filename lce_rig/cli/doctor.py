@@ -49,7 +49,7 @@ def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder:
     checks = examine(rig, duration, folder)
     severity = worst(found for check in checks for found in check.findings)
     if as_json:
-        # Figures that were not measured are null.
+        # Unmeasured figures are null.
         lines = [
             {
                 "subject": check.subject,
@@ -75,7 +75,7 @@ def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder:
 
 
 def _lines(checks: list[Check]) -> list[str]:
-    """List a line per check, and its actions below it."""
+    """List a line per check, with its actions below."""
     subject_width = max((len(check.subject) for check in checks), default=0)
     name_width = max((len(check.name) for check in checks), default=0)
     lines, last = [], ""

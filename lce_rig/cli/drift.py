@@ -124,7 +124,7 @@ def _sensors(pair: PairDrift) -> str:
 
 
 def _parts(pair: PairDrift) -> Iterator[Any]:
-    """State the verdict, the scene's answer, that of the boards, and one action."""
+    """State the verdict, the answers from the scene and from the boards, and one action."""
     data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.estimate.n_edges} edges"
     yield f"[bold]{_sensors(pair)}[/]: [{_COLOURS[pair.state]}]{STATES[pair.state]}[/] ({data})"
     for finding in (*pair.contradictions, *pair.drift.findings):
@@ -136,6 +136,6 @@ def _parts(pair: PairDrift) -> Iterator[Any]:
 
 
 def _of_boards(board: BoardDrift) -> str:
-    """Return the boards' first finding; their blind directions come last."""
+    """Return the first finding from the boards, unobservable directions last."""
     opinion = f"{show.counted(board.n_boards, 'board')}: {STATES[board.state]}"
     return f"{opinion}; {board.findings[0].text}"

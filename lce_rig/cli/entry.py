@@ -8,9 +8,9 @@ from pathlib import Path
 
 from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_more, watch_for_interrupts
 
-# Share of the computer's memory and swap that a process may take: more makes it swap, and other programs end.
+# Limit as a share of the computer's memory and swap: above it the computer thrashes and kills programs.
 _SHARE_OF_MEMORY = 0.8
-# Least limit, bytes: sound sessions need 0.7 GB at most.
+# Lower bound of the limit, bytes: intact sessions need at most 0.7 GB.
 _LEAST_BYTES = 1 << 30
 
 
@@ -31,7 +31,7 @@ def main() -> None:
         sys.stderr.write(f"{INTERRUPTED}\n")
         code = EXIT_INTERRUPTED
     if code == EXIT_INTERRUPTED:
-        # Python's own exit would wait for running threads.
+        # Python's own exit would wait for running threads, so exit without it.
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):
                 stream.flush()
@@ -65,7 +65,7 @@ def limit_opencv() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Open /dev/null for standard streams that are closed (`lce-rig collect <&-`), as for services."""
+    """Open /dev/null for closed standard streams (`lce-rig collect <&-`), as services have them."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123

@@ -1,4 +1,4 @@
-"""`lce-rig fleet`: run the sessions of many robots, ask questions of their results, and deploy them."""
+"""`lce-rig fleet`: calibrate the sessions of many robots, query their results, and deploy them."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from lce_rig.session.durable import write_atomically
 if TYPE_CHECKING:
     from lce_rig.fleet.rollout import RobotState
 
-# Ctrl-C: sessions end at once, workers and the table take their time.
+# Grace period after Ctrl-C, s: sessions end at once, workers and the table take longer.
 _GRACE_S = 20.0
 _SHOWN = (
     "robot",
@@ -193,7 +193,7 @@ def table(registry: str, where: str, columns: list[str] | None, as_json: bool, r
 
 
 def _summary(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Sum a row up for people, under `_HEADINGS`."""
+    """Summarise a row for the terminal, in the columns `_HEADINGS`."""
     sigmas = (
         "-" if row[name] is None else f"{scale * row[name]:.{digits}f}"
         for name, scale, digits in (("sigma_rotation_deg", 1.0, 3), ("sigma_translation_m", 1000.0, 1))

@@ -110,10 +110,10 @@ def intrinsics(
 
 
 def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[str]:
-    """State the judgement with its action, the fit, the intrinsics and the weakness that matters most.
+    """State the judgement with its action, the fit, the intrinsics and the main weakness.
 
     Args:
-        measured: of one camera.
+        measured: estimated intrinsics of one camera.
         advice: the action, or "".
         whole: the command that explains all.
     """

@@ -1,4 +1,4 @@
-"""`lce-rig`: load the verbs when they are called, and turn errors into exit codes."""
+"""`lce-rig`: load subcommands when called, and turn errors into exit codes."""
 
 import importlib
 import os
@@ -15,8 +15,8 @@ from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED
 
 __all__ = ["COMMANDS", "main", "run"]
 
-# Verb -> (module with a click command of the verb's name, help line). Modules are imported when the verb
-# runs, so that `lce-rig --help` stays instant.
+# Subcommand -> (module with a click command of that name, help line). Modules are imported when the command
+# runs, so that `lce-rig --help` starts instantly.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
     "board": ("lce_rig.cli.rigs", "Draw a board to print at scale, with its profile block."),
@@ -52,7 +52,7 @@ class LateGroup(click.Group):
     """A group that imports a command only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """List the verbs in the order of the work."""
+        """List the subcommands in the order of the work."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -65,14 +65,14 @@ class LateGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of verbs without importing them."""
+        """Write the list of subcommands without importing them."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Name the nearest verb when the one given does not exist."""
+        """Suggest the nearest subcommand for one that does not exist."""
         import difflib
 
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
@@ -115,7 +115,7 @@ def run(arguments: list[str]) -> int:
         error.show()
         return error.exit_code
     except BrokenPipeError:
-        # The reader of our output has gone (`lce-rig check | head`).
+        # The reader of our output has closed the pipe (`lce-rig check | head`).
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except (Exception, KeyboardInterrupt) as error:

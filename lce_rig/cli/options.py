@@ -1,4 +1,4 @@
-"""Option types and options that several verbs share."""
+"""Option types and options shared by several subcommands."""
 
 import math
 from collections.abc import Callable, Collection, Sequence

@@ -20,11 +20,12 @@ from lce_rig.io.events.event_recording import EventRecording
 from lce_rig.show.overlays.canvas import write_picture
 
 STAMPS = "stamps.csv"
-# 14 hours at the default period; one wrong timestamp makes a recording centuries long.
+# Maximum number of images: 14 hours at the default period; a wrong timestamp can make a recording centuries
+# long.
 _MAX_IMAGES = 1_000_000
-# Enough for the network to settle before the first requested image.
+# Time for the network to settle before the first requested image, ns.
 _WARM_UP_NS = 1_500_000_000
-# Start of the recording in which flicker of lamps is measured.
+# Length of the recording's start in which flicker is measured, ns.
 _FIRST_NS = 1_000_000_000
 
 
@@ -108,7 +109,7 @@ def _write(
     lines = ["picture,stamp_ns"]
     files: list[Path] = []
     refused: list[str] = []
-    # The part of the recording that the images need.
+    # Part of the recording needed for the images.
     from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
     needed = takewhile(lambda stretch: stretch.t_ns[0] <= until_ns, events)
     stretches = (stretch.between(from_ns, until_ns) for stretch in needed)

@@ -1,4 +1,4 @@
-"""`lce-rig rigs`: list, show, check and derive rig profiles; `lce-rig board`: a board to print for one."""
+"""`lce-rig rigs`: list, show, check and derive rig profiles; `lce-rig board`: draw a board to print."""
 
 import re
 from pathlib import Path
@@ -54,7 +54,7 @@ def list_profiles() -> None:
 @click.option("--all", "is_whole", is_flag=True, help="Print settings that have their default, too.")
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
 def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
-    """Print the profile RIG, a name or a file, as YAML without settings that have their default."""
+    """Print the profile RIG, a name or a file, as YAML without settings at their default."""
     rig = load_rig(rig_name)
     if as_json:
         show.print_json(rig.model_dump(mode="json"))
@@ -91,7 +91,7 @@ def check_profile(file: str) -> None:
     "--intrinsics",
     multiple=True,
     metavar="FILE|NUMBERS",
-    help="Of each camera in turn: a file (camera_info of ROS, ost.txt, Kalibr's camchain, OpenCV's "
+    help="Intrinsics of each camera, in order: a file (ROS camera_info, ost.txt, Kalibr's camchain, OpenCV's "
     "FileStorage, FAST-LIVO2's camera), or MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,...",
 )
 @click.option(
@@ -119,7 +119,7 @@ def new_profile(
     settings: tuple[str, ...],
     output: str | None,
 ) -> None:
-    """Write a profile NAME: for sensors of your own, from a bag of them, or derived from another profile.
+    """Write a profile NAME for your own sensors, from their bag or from another profile.
 
     \b
       lce-rig rigs new truck --lidar OS1-64 --camera front --intrinsics camera_info.yaml \\
@@ -185,7 +185,7 @@ def new_profile(
 
 
 def _find_recording(origin: str | None) -> Path | None:
-    """Return the path of a recording; None for the name or the file of a profile.
+    """Return the path of a recording; None for a profile's name or file.
 
     Raises:
         SourceError: it is neither, or not there.
@@ -197,7 +197,7 @@ def _find_recording(origin: str | None) -> Path | None:
 
 
 def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:
-    """Give the keys that --board changes in the profile that is derived from."""
+    """Return the keys of the parent profile that --board changes."""
     stated = parent.board.model_dump(exclude_none=True, exclude_unset=True)
     plate = {"type": "checkerboard"} | board_block(parse_board(board))
     foreign = [key for key in stated if key not in plate and not key.endswith("sigma_m")]
@@ -206,7 +206,7 @@ def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
 _PLATE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)x(\d+(?:\.\d*)?|\.\d+)")
-# About the plate on the page; below it stand the profile block and how to mount the board.
+# Space around the plate on the page, for the profile block and mounting instructions below it, mm.
 _MARGIN_MM, _TEXT_MM, _LINE_MM = 15.0, 75.0, 5.0
 _MM_PER_INCH = 25.4
 _MOUNTING = (
@@ -287,7 +287,7 @@ def board(
 
 
 def _draw_board(board: Board, block: str, output: str) -> None:
-    """Draw the print, the plate's outline and the words on a page of its own size."""
+    """Draw the pattern, the plate's outline and the text on a page of matching size."""
     from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle

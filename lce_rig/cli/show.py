@@ -1,4 +1,4 @@
-"""Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
+"""Terminal output: tables, progress bars, notes. Results go to stdout, everything else to stderr."""
 
 import json
 import shlex
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
 _MOST_UNBROKEN, _WIDTH = 24, 80
-# Lines that go on stand below the text after "-> ".
+# Indentation of continuation lines: below the text after "-> ".
 _HANG = 3
 # Shortest and longest time between two lines of progress, s.
 _SHORTEST_S, _LONGEST_S = 2.0, 30.0
@@ -40,7 +40,7 @@ def say(text: str) -> None:
 
 
 def wrapped(text: str, stream: Any) -> str:
-    """Break lines at words to the width of the terminal that gets them, indented; files get them whole."""
+    """Wrap and indent lines at the terminal's width; lines for files stay whole."""
     if not stream.isatty():
         return text
     width = shutil.get_terminal_size().columns
@@ -81,12 +81,12 @@ def cause_lines(cause: str, action: str, colour: str = "none") -> list[str]:
 
 
 def name_next(verb: str, session: Path, options: str = "") -> None:
-    """Name the verb to type next on stderr."""
+    """Print the suggested next command on stderr."""
     note(f"  next         {command(verb, session, options)}")
 
 
 def command(verb: str, session: Path, options: str = "") -> str:
-    """Write a command; the default session goes without saying."""
+    """Build a command; the default session is omitted."""
     chosen = "" if session == Path("session") else f" {shlex.quote(str(session))}"
     return f"lce-rig {verb}{chosen}{options}"
 
@@ -161,7 +161,7 @@ def print_table(table: Any) -> None:
     from rich.console import Console
 
     for column in table.columns:
-        # Where space is short, sentences wrap, not names and figures.
+        # In narrow terminals, wrap sentences, not names and figures.
         column.no_wrap = max((len(str(cell)) for cell in column.cells), default=0) <= _MOST_UNBROKEN
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
@@ -178,21 +178,21 @@ class ProgressBar:
         self._bar.update(self._task, completed=done, total=total)
 
     def begin(self, step: str) -> None:
-        """Name the step; the bar moves to and fro until its (done, total) are known."""
-        # A task's total cannot be unset.
+        """Name the step; the bar bounces until its (done, total) are known."""
+        # rich cannot unset a task's total, so replace the task.
         self._bar.remove_task(self._task)
         self._task = self._bar.add_task(f"{self._title}: {step}", total=None)
 
 
 class ProgressLines:
-    """Lines of progress for a file or a pipe: at every 10 %, and at least every 30 s; none of short work."""
+    """Progress lines for a file or a pipe: every 10 %, at least every 30 s; none for short work."""
 
     def __init__(self, title: str, now_s: Callable[[], float] = time.monotonic) -> None:
         self._title, self._now_s = title, now_s
         self._last_s, self._tenths = now_s(), 0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print how many are done, if it is time."""
+        """Print the progress, if a line is due."""
         passed_s, tenths = self._now_s() - self._last_s, 10 * done // max(total, 1)
         is_step = tenths > self._tenths and passed_s >= _SHORTEST_S
         if done < total and (is_step or passed_s >= _LONGEST_S):
@@ -205,7 +205,7 @@ def progress_bar(title: str, *, has_lines: bool = False) -> Iterator[Progress]:
     """Show a progress bar of this title on stderr.
 
     Args:
-        title: of the work.
+        title: title of the work.
         has_lines: prints lines if stderr is not a terminal; by default, it gets nothing then.
     """
     from rich.console import Console
@@ -222,12 +222,12 @@ def progress_bar(title: str, *, has_lines: bool = False) -> Iterator[Progress]:
 
 
 def harmless(text: str) -> str:
-    """Write a stranger's control characters as escapes, so that a terminal does not obey them."""
+    """Escape control characters in foreign text, so that the terminal does not execute them."""
     return "".join(each if each.isprintable() or each in "\n\t" else repr(each)[1:-1] for each in text)
 
 
 def escape(text: str) -> str:
-    """Keep rich from reading brackets in names as markup, and the terminal from obeying them."""
+    """Escape brackets and control characters in names, so that rich and the terminal print them literally."""
     from rich.markup import escape as escape_markup
 
     return escape_markup(harmless(text))

@@ -30,7 +30,7 @@ from lce_rig.simulate import (
 from lce_rig.simulate.sampling import stamp_of
 
 TRUTH = "truth.json"
-# Default size of a session, placements, and of a recording, s: each is simulated in a few minutes.
+# Default size of a session, placements, and of a recording, s; either simulates in a few minutes.
 _CAPTURES, _DURATION_S = 30, 20.0
 # Time to simulate 1 s of a recording, s.
 _WALL_PER_S = 10
@@ -148,7 +148,7 @@ def _simulate_recording(
         raise SourceError(f"{folder} exists already", hint)
     show.note(f"simulating {duration_s:g} s of rig {rig.name}, about {_WALL_PER_S * duration_s:.0f} s ...")
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
-    # Only a whole recording gets the folder's name.
+    # Only a complete recording gets the folder's name.
     with _beside(folder) as draft, show.progress_bar("simulating, ms") as progress:
         with BagRecorder.in_folder(draft, rig) as recorder:
             write_truth(draft / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
@@ -164,7 +164,7 @@ def _simulate_recording(
 
 @contextmanager
 def _beside(folder: Path) -> Iterator[Path]:
-    """Give a path on a folder's disk, removed in the end unless it was renamed.
+    """Yield a temporary path on the folder's disk, removed at the end unless renamed.
 
     Raises:
         SourceError: nothing can be written there.
@@ -180,7 +180,7 @@ def _beside(folder: Path) -> Iterator[Path]:
 
 
 def require_kind(session: Path, seed: int | None) -> None:
-    """Refuse to mix simulated captures with real ones or with those of another simulation.
+    """Refuse to mix simulated captures with real ones or with another simulation's.
 
     Args:
         session: the session that gets captures; may not exist yet.
@@ -206,7 +206,7 @@ def require_kind(session: Path, seed: int | None) -> None:
 
 
 def write_truth(path: Path, document: dict[str, Any]) -> None:
-    """Write indented JSON with each innermost list, such as a row of a matrix, on a line of its own."""
+    """Write indented JSON with each innermost list, such as a matrix row, on one line."""
     text = json.dumps(document, indent=1)
     text = re.sub(r"\[([^\[\]{}\"]+)\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     path.write_text(text + "\n", encoding="utf-8")

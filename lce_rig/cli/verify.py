@@ -79,7 +79,7 @@ def verify(
 
 
 def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterator[Any]:
-    """State whether the captures agree with the extrinsics, mean residuals and where the images are."""
+    """State whether the captures agree with the extrinsics, the mean residuals and the images' folder."""
     c, doubts, pair = checked.calibration, checked.findings, str(checked.pair)
     colour = {"note": "green", "warning": "yellow", "error": "red"}[worst(doubts)]
     opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]

@@ -1,4 +1,4 @@
-"""Board search in a separate process: in the newest frame of a live rig, or ahead in a recording."""
+"""Board search in a separate process: in the newest images of a live rig, or ahead in a recording."""
 
 import time
 from collections import deque
@@ -12,12 +12,12 @@ from lce_rig.core.findings import Refusal
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import Frame
 
-# Frames that wait for their images to be searched; each holds an image of each camera.
+# Maximum number of frames waiting for the image search; each holds an image per camera.
 _N_AHEAD = 8
 
 
 def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[BoardDetection]:
-    """Find the board in frames: in images by another process, while this one reads on and searches scans.
+    """Find the board in frames, searching images in another process and scans in this one.
 
     Args:
         tracker: has not been used before.
@@ -45,16 +45,16 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
             caller.shutdown(wait=False, cancel_futures=True)
 
 
-# Least interval of thorough searches of an image without a board, which delay guidance even longer.
+# Minimum interval between thorough searches of an image without a board, s; they delay the guidance.
 _THOROUGH_S = 3.0
-# Least interval of searches of a whole scan while all candidates are followed.
+# Minimum interval between searches of a whole scan while all candidates are tracked, s.
 _RESCAN_S = 1.0
-# Least interval of both in units of the longest recent time per frame; decay of that time per frame.
+# Minimum interval of both in units of the longest recent time per frame; decay of that time per frame.
 _RARE, _FORGET = 6.0, 0.95
 
 
 class BoardSearch(Worker):
-    """A `BoardTracker` in its own process; the frames' events are not sent to it."""
+    """A `BoardTracker` in its own process, which does not receive the frames' events."""
 
     def __init__(self, rig: Rig) -> None:
         """Prepare; see `BoardTracker`."""
@@ -80,7 +80,7 @@ class BoardSearch(Worker):
 
 
 class _Search:
-    """The object in that process: it does not send the searched samples back."""
+    """The tracker in that process; it does not send the searched samples back."""
 
     def __init__(self, rig: Rig, thorough_interval_s: float, rescan_interval_s: float = 0.0) -> None:
         self._tracker = BoardTracker(rig, thorough_interval_s, rescan_interval_s)
@@ -93,8 +93,8 @@ class _Search:
     def sight(self, frame: Frame) -> BoardDetection:
         began_s = time.monotonic()
         detection = self._tracker.sight(frame)
-        # On a busy computer a thorough search may take longer than the time to the next one: rare searches
-        # must stay rare, or every frame waits for one.
+        # On a busy computer a thorough search may take longer than the interval to the next one. Keep such
+        # searches rare, so that not every frame waits for one.
         self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
         self._tracker.thorough_interval_s = max(_THOROUGH_S, _RARE * self._longest_s)
         self._tracker.rescan_interval_s = max(_RESCAN_S, _RARE * self._longest_s)
@@ -108,5 +108,5 @@ class _Search:
 
 
 def _without_samples(detection: BoardDetection) -> BoardDetection:
-    """Drop the images and scans that were searched, which take long to send to another process."""
+    """Drop the searched images and scans, which are slow to send to another process."""
     return replace(detection, frame=replace(detection.frame, images=(), scans=()))

@@ -20,7 +20,7 @@ from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
-# Interval between searches of a whole image without a board, and of a scan after a candidate is lost, s.
+# Interval between full searches, s: of images without a board, and of scans whose candidate was lost.
 _SEARCH_S = 0.3
 # Factor on the tolerance of the nominal extrinsics within which a candidate counts as the camera's board.
 _NOMINAL_MARGIN = 1.5
@@ -56,7 +56,7 @@ class BoardDetection:
 
     @property
     def is_usable(self) -> bool:
-        """Whether a camera and a LiDAR, or two sensors of a rig of one kind, see a board within limits."""
+        """Whether enough sensors see a usable board: camera and LiDAR, or two in a rig of one kind."""
         if not self.images:
             return len(self.lidars) > 1
         cameras = {camera for camera, _ in self.images.keys() - self.unfit.keys()}
@@ -66,7 +66,7 @@ class BoardDetection:
 
 @dataclass(frozen=True, eq=False)
 class CaptureMoment:
-    """A detection worth a capture.
+    """A detection worth capturing.
 
     Attributes:
         detection: the board in its frame.
@@ -81,7 +81,7 @@ class CaptureMoment:
 
 @dataclass
 class BoardTracker:
-    """Finds the board frame by frame, near its last place, so that a long recording is searched quickly.
+    """Finds the board in each frame, near its last position, so that long recordings are searched quickly.
 
     Attributes:
         rig: the profile.
@@ -136,7 +136,7 @@ class BoardTracker:
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
 
     def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
-        """Find the board in every scan too if an image shows it, and count unusable boards."""
+        """If an image shows the board, find it in every scan too, and count unusable boards."""
         for refusal in detection.unfit.values():
             self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
@@ -155,12 +155,12 @@ class BoardTracker:
         for key in detection.images:
             self._unseen.pop(key, None)
         if not detection.images and not are_scans_enough:
-            self._n_candidates.clear()  # A board that returns is searched for at once.
+            self._n_candidates.clear()  # Search at once for a board that returns.
             self.refusals.add(self._explain_none(detection))
         return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def _explain_none(self, detection: BoardDetection) -> Refusal:
-        """Return why a frame has no usable board: the refusal of one in an image, else that none was found.
+        """Return why a frame has no usable board: an image's refusal, else "not found".
 
         Frames between two searches of an image have the reason of the earlier one.
         """
@@ -200,7 +200,7 @@ class BoardTracker:
     def _find_elsewhere(
         self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
     ) -> Refusal | None:
-        """Refuse scans in which all candidates are other things than the board in the images.
+        """Refuse scans with candidates only at other positions than the board in the images.
 
         Nominal extrinsics may be wrong: they decide for a camera and a LiDAR once they have fitted a moment.
         """
@@ -235,7 +235,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Check whether an interval has passed since the last time for a key, and if so note the new time."""
+    """Check whether an interval has passed since the last time for a key; if so, store the new time."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False
@@ -246,7 +246,7 @@ def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: in
 def _compare(
     board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic
 ) -> tuple[float, Refusal]:
-    """Compare candidates with where an image and nominal extrinsics have the board.
+    """Compare candidates with the board pose expected from an image and the nominal extrinsics.
 
     Returns:
         The best one's misfit, 1 for the largest that is allowed, and the refusal if it is larger.

@@ -30,7 +30,7 @@ def with_event_pictures(
     Args:
         samples: scans and packets of events, the earliest first.
         rig: says how images are made.
-        cameras: of whose events images are wanted.
+        cameras: cameras of whose events images are wanted.
         tally: receives why a scan got none.
         is_live: make each image a step of the network instead of an extra run, which is quicker; images
             then depend on which scans came.
@@ -48,7 +48,7 @@ def with_event_pictures(
 
 
 class _Darkroom:
-    """Events of one camera, waiting for the times of the images to reconstruct."""
+    """Events of one camera, buffered until the times of the requested images are known."""
 
     def __init__(self, rig: Rig, camera: str, tally: Losses, is_live: bool) -> None:
         channel = event_channel(rig, camera) or ""
@@ -69,7 +69,7 @@ class _Darkroom:
             self._packets.append(sample)
         elif isinstance(sample, Scan):
             middle_ns = middle_of_sweep_ns(sample, self._rig)
-            # Two LiDARs may ask out of turn, by less than the events wait.
+            # Two LiDARs may request images out of order, by less than the buffer's delay.
             if middle_ns is not None and (not self._wanted or middle_ns > self._wanted[-1]):
                 self._wanted.append(middle_ns)
         self._newest_ns = max(self._newest_ns, rig_time_ns(sample, self._rig) or self._newest_ns)
@@ -81,7 +81,7 @@ class _Darkroom:
         yield from self._develop()
 
     def _develop(self) -> Iterator[Image]:
-        # Scans come late in bags: events wait for them before the network uses them.
+        # Scans arrive late in bags: buffer the events before the network uses them.
         while self._wanted:
             stamp_ns = self._wanted[0] - self._offset_ns
             has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] >= stamp_ns
@@ -103,7 +103,7 @@ class _Darkroom:
             self._feed(min([self._newest_ns - PATIENCE_NS, *self._wanted]) - self._offset_ns)
 
     def _feed(self, until_ns: int) -> None:
-        """Feed the network all events before a timestamp of their clock."""
+        """Feed the network all events before a timestamp of its clock."""
         while self._packets and self._packets[0].t_ns[0] < until_ns:
             packet = self._packets.popleft()
             rest = packet.between(until_ns, int(packet.t_ns[-1]) + 1)

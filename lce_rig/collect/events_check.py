@@ -22,19 +22,19 @@ _LEAST_NS, _MOST_NS = 30_000_000, 250_000_000
 _STEP_NS, _MOST_LAG_NS = 50_000_000, 500_000_000
 _LAGS_NS = tuple(range(-_MOST_LAG_NS, _MOST_LAG_NS + 1, _STEP_NS))
 _WAIT_NS = 400_000_000
-# Fraction of the pixels with events between two images from which the scene counts as moving.
+# Fraction of pixels with events between two images above which the scene counts as moving.
 _MOVING = 0.01
-# Pairs of images compared at most, and at least for a finding.
+# Maximum number of compared image pairs, and minimum for a finding.
 _MOST_PAIRS, _LEAST_PAIRS = 60, 8
-# Correlation that shows a turn, a sign and an offset, and how many times it exceeds that of another turn or
-# sign. Simulated DAVIS346 reach 0.4 to 0.7; neighbouring lobes have a quarter of it.
+# Correlation that establishes a rotation, sign and offset, and its minimum ratio to that of another rotation
+# or sign. Simulated DAVIS346 reach 0.4 to 0.7; neighbouring lobes a quarter of it.
 _AGREES, _EXCEEDS = 0.1, 2.0
 _SIGNED = 0.3
-# Offset between events and frames that is named, s; `calibrate` estimates smaller ones.
+# Offset between events and frames above which it is reported, s; `calibrate` estimates smaller ones.
 _LATE_S = 0.1
-# Darkest grey value that takes part, which bounds the noise of its logarithm.
+# Darkest grey value compared; it bounds the noise of the logarithm.
 _DARKEST = 4.0
-# Steps through the rows and columns of an image that undo each turn of the events.
+# Steps through the rows and columns of an image that undo each rotation of the events.
 _TURNS = {
     "": (1, 1),
     "rotated by 180 deg": (-1, -1),
@@ -44,7 +44,7 @@ _TURNS = {
 
 
 class _Change(NamedTuple):
-    """Change of an image's logarithm of brightness (H, W) from one time of the rig's clock to another."""
+    """Change of an image's log brightness (H, W) between two times of the rig's clock."""
 
     start_ns: int
     end_ns: int
@@ -61,7 +61,7 @@ class EventsCheck:
         self._scores: dict[str, list[Array]] = {}
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Pass frames on and compare each change between two images with the events meanwhile.
+        """Pass frames on, and compare the change between successive images with the events in between.
 
         Raises:
             SourceError: a camera's events are rotated or mirrored against its frames.
@@ -135,7 +135,7 @@ class EventsCheck:
 
 
 def _correlate(change: _Change, cut: EventCut, lag_ns: int) -> list[float]:
-    """Correlate a change with the events that come later by a lag, for each turn of the image."""
+    """Correlate a change with the events after a lag, for each rotation of the image."""
     size = cut.packets[0].height_px, cut.packets[0].width_px
     if change.brighter.shape != size:
         return [math.nan] * len(_TURNS)
@@ -158,7 +158,7 @@ def _sum(packets: tuple[Events, ...], start_ns: int, end_ns: int, size: tuple[in
 
 
 def _correlation(one: Array, other: Array) -> float:
-    """Correlate two maps (H, W); NaN if nothing moves."""
+    """Correlate two maps (H, W); NaN without motion."""
     spread = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))
     if spread == 0 or np.count_nonzero(other) < _MOVING * other.size:
         return math.nan

@@ -1,4 +1,4 @@
-"""Why captures are not taken, why guidance is missing, and why a collection continues."""
+"""Reasons why captures are rejected, why guidance is missing, and why collection continues."""
 
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import captures_to_add

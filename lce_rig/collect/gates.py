@@ -1,4 +1,4 @@
-"""Moments worth a capture: the board at rest, or the best of every place that a moving board passes.
+"""Moments worth capturing: a board at rest, or the best moment at each place that a moving board passes.
 
 Events need motion, LiDAR wants stillness. A detection will do where, in a camera that sends events, the board
 
@@ -37,18 +37,18 @@ from lce_rig.detect.findings import IMAGE_FLICKER
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import EventCut, rig_time_ns
 
-# Least time for which a board must stand still, in seconds and in scans.
+# Minimum time of rest, in seconds and in scans.
 _WINDOW_S, _WINDOW_SCANS = 0.5, 2.5
 
 
 def stillness_window_s(rig: Rig) -> float:
-    """Return how long a board must stand still: LiDARs without rings accumulate scans in this time."""
+    """Return the required time of rest: LiDARs without rings accumulate scans in this time."""
     slowest_hz = min((lidar.rate_hz for lidar in rig.lidars.values() if not lidar.has_rings), default=np.inf)
     return max(_WINDOW_S, _WINDOW_SCANS / slowest_hz)
 
 
 class StillnessGate:
-    """Picks the stillest moment of every period of stillness from detections in order of time.
+    """Picks the moment of least motion in each period of rest; detections come in order of time.
 
     It is the middle of the window with the least motion, of those below `max_motion_m`. A period ends when
     the board moves, is lost, or has stood for `dwell_s`; its moment is then returned once.
@@ -59,7 +59,7 @@ class StillnessGate:
         dwell_s: time after which a capture is taken without waiting for the board to be moved on.
         takes_singles: whether a detection without others in two windows before and after it is a moment, as
             in a recording triggered once per placement; its stillness cannot be checked.
-        window_s: of stillness.
+        window_s: length of the window of stillness.
 
     Attributes:
         motion_m: motion of the board in the last window; infinite without a complete window.
@@ -88,7 +88,7 @@ class StillnessGate:
         self._since_ns = 0
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection; return the moment of a period that ends with it."""
+        """Take the next detection; if it ends a period of rest, return the moment of that period."""
         now_ns = detection.frame.time_ns
         is_apart = self._last_ns is None or now_ns - self._last_ns > 2 * self._window_ns
         alone = self._take_single() if is_apart else []
@@ -108,7 +108,7 @@ class StillnessGate:
         return alone
 
     def finish(self) -> list[CaptureMoment]:
-        """Return the moment of the present period, if any, and end the period."""
+        """End the present period of rest and return its moment, if any."""
         return [*self._take_single(), *self._end_stretch()]
 
     def _take_single(self) -> list[CaptureMoment]:
@@ -120,7 +120,7 @@ class StillnessGate:
         return [] if best is None else [best]
 
     def _measure(self, detection: BoardDetection) -> float:
-        """Put a detection into the window and measure how far the board moved in it."""
+        """Add a detection to the window and compute how far the board moved in it."""
         window = self._window
         now_ns, window_ns = detection.frame.time_ns, self._window_ns
         # Start again after a gap, or if the clock was set back.
@@ -135,7 +135,7 @@ class StillnessGate:
 
 
 def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) -> float:
-    """Measure how far the board moved within a window.
+    """Compute how far the board moved within a window.
 
     Corners show motion across the line of sight much better than poses do; planes show motion along it.
     """
@@ -143,15 +143,15 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     motions: list[float] = []
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
-        # Without markers the order may start at the other end: a symmetric pattern has no unique top, and
-        # reconstructed images may have the colours of its squares inverted.
+        # Without markers, the corner order may start at the other end: a symmetric pattern has no unique top,
+        # and reconstructed images may invert the squares' colours.
         steps = (1,) if board.has_markers else (1, -1)
         shift_px = max(
             min(_rms(corners[::step] - reference.corners_px) for step in steps) for corners in others
         )
         square_px = _square_px(reference.corners_px, board)
         motions.append(shift_px * board.square_m / max(square_px, 1e-6))
-    # Corners show turns; without a camera the planes must, at the plate's.
+    # Corners reveal rotations; without a camera, the planes at the plate's position must.
     where = np.zeros((1, 3)) if motions else board.outline()
     lidar_motions = [
         min(
@@ -163,7 +163,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
         )
         for lidar, candidates in middle.lidars.items()
     ]
-    # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
+    # Walls and tables never move, so the cameras, which identify the board by its pattern, must agree.
     if not motions or not lidar_motions:
         return max([*motions, *lidar_motions])
     return max(max(motions), min(lidar_motions))
@@ -183,7 +183,7 @@ def _square_px(corners_px: Array, board: Board) -> float:
 
 
 def _rms(difference: Array) -> float:
-    """Compute the rms of differences (N, 2) of the corners that both images show; infinite without any."""
+    """Compute the rms difference (N, 2) of the corners visible in both images; infinite without any."""
     squares = np.sum(difference**2, axis=-1)
     squares = squares[np.isfinite(squares)]
     return float(np.sqrt(np.mean(squares))) if len(squares) else np.inf
@@ -204,20 +204,20 @@ def _plane_motion_m(
     return float(np.abs(transform(reference.T_lidar_board, where) @ plane[:3] + plane[3]).max())
 
 
-# Best speed of the board: slower ones give few events, faster ones smear.
+# Best speed of the board, m/s: slower motion gives few events, faster motion smears.
 BEST_SPEED_MPS = 0.1
 
 _LEAST_DETECTIONS = 3
-# Least events per pixel and second of a board slower than `MIN_SPEED_MPS`.
+# Minimum event rate per pixel, 1/s, of a board slower than `MIN_SPEED_MPS`.
 _PLENTY_EVENTS_PX = 4.0
-# Time without events, ns, after which the stream of a camera counts as ended if the board moves.
+# Time without events while the board moves after which a camera's stream counts as ended, ns.
 _SILENT_NS = 100_000_000
 
 
 def judge_detection(
     detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig, *, takes_frames: bool = False
 ) -> CaptureMoment | Refusal | None:
-    """Check whether a detection is worth a capture.
+    """Check whether a detection is worth capturing.
 
     Args:
         detection: the board in its frame.
@@ -276,7 +276,7 @@ def _judge_camera(
     # Frames and events of one camera may have different clocks or delays.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
-    # Count the events per pixel of the board in the second before its image.
+    # Count the events per pixel on the board in the second before its image.
     recent = cut.events.between(stamp_ns - MEMORY_NS, stamp_ns)
     camera, board = rig.cameras[key[0]], detection.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
@@ -297,7 +297,7 @@ def _judge_camera(
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
-    """Fit a straight path at constant speed to the plate's middle: speed, m/s, and rms distance from it, m.
+    """Fit a straight constant-speed path to the plate's centre: speed, m/s, and rms deviation, m.
 
     The middle is accurate even if the tilt is not. None if the board was detected too rarely.
     """
@@ -312,12 +312,12 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-# Deviation from a straight path that counts as much as a speed e times too high or low.
+# Deviation from a straight path equivalent to a speed wrong by a factor e, m.
 _UNSTEADY_M = 0.01
 
 
 class MotionGate:
-    """Picks the best moment of every placement that the board passes from detections in order of time.
+    """Picks the best moment at each placement that the board passes; detections come in order of time.
 
     Args:
         rig: the profile.
@@ -343,9 +343,9 @@ class MotionGate:
         self.judged: CaptureMoment | Refusal | None = None
         self._rig, self._taken, self._tally = rig, taken, tally
         self._takes_frames = takes_frames
-        # The board's speed is measured over half a second about a detection.
+        # The board's speed is measured over half a second around a detection.
         self._half_ns, self._patience_ns = 0.25e9, patience_s * 1e9
-        # The last detections wait for later ones near in time, and moments for better ones.
+        # The last detections wait for later ones close in time, and moments for better ones.
         self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0
         self._pending: deque[CaptureMoment] = deque()
@@ -392,7 +392,7 @@ class MotionGate:
         return moments
 
     def _decide_oldest(self) -> list[CaptureMoment]:
-        """Return the oldest moment if it is the best of its place, else drop it."""
+        """Return the oldest moment if it is the best at its place, else drop it."""
         oldest = self._pending.popleft()
         if self._taken.has_like(oldest.detection.poses):
             return []

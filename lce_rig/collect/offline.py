@@ -1,4 +1,4 @@
-"""Build a session from recordings, unattended: new placements become captures, all refusals are counted."""
+"""Build a session from recordings, unattended: new placements become captures, refusals are counted."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -35,9 +35,9 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 
-# Interval of thorough searches of an image without a board, which take most of a second each.
+# Interval between thorough searches of an image without a board, s; each takes most of a second.
 _THOROUGH_S = 1.0
-# Least samples for which a separate process for images is worth its start of a second.
+# Minimum number of samples that justify a separate process for images, which takes a second to start.
 _LONG_SAMPLES = 200
 
 
@@ -121,7 +121,7 @@ class _Collector:
         # Captures, rejected ones included, by the key of their data.
         self._names_by_key: dict[str, str] = {}
         for capture in session.captures + session.rejected:
-            with suppress(SessionError):  # A damaged capture is named when it is used.
+            with suppress(SessionError):  # A damaged capture is reported when it is used.
                 source = capture.meta.get("source", {})
                 if isinstance(source, dict) and isinstance(source.get("key"), str):
                     self._names_by_key[source["key"]] = capture.name
@@ -176,9 +176,9 @@ class _Collector:
         unwanted = {name for key, name in self._names_by_key.items() if key.startswith(f"{recording.key}:")}
         rejected = [capture for name, capture in self._rejected.items() if name in unwanted]
         for capture in [*self._session.captures, *rejected]:
-            with suppress(LceRigError):  # A damaged capture is named when it is used.
+            with suppress(LceRigError):  # A damaged capture is reported when it is used.
                 known.add(capture.name, capture_poses(capture, self._session))
-        # For cameras that send events only, images are reconstructed as the stream runs.
+        # Reconstruct images for cameras without frames while the stream runs.
         with_images = {stream.sensor for stream in recording.streams if stream.kind == "images"}
         events = [stream for stream in recording.streams if stream.kind == "events"]
         reconstructed = {(s.sensor, s.channel) for s in events if s.sensor not in with_images}
@@ -295,7 +295,7 @@ class _Collector:
         self.report.captured.append(name)
 
     def _compare_beams(self, scan: Scan) -> None:
-        """Note once if a LiDAR's rings are not those of its model."""
+        """Add a note, once, if a LiDAR's rings differ from its model's."""
         if scan.sensor not in self._compared:
             self._compared.add(scan.sensor)
             found = compare_beams(scan, self._session.rig.lidars[scan.sensor])
@@ -305,7 +305,7 @@ class _Collector:
         return self._n_wanted is not None and self._n_captures >= self._n_wanted
 
     def _read(self, recording: ContinuousRecording) -> Iterator[Sample]:
-        """Yield samples up to a tear, whose error is kept: moments before it are still captured."""
+        """Yield samples up to a damaged part; its error is kept, and earlier moments are still captured."""
         done, self._torn = 0, None
         first_ns: int | None = None
         try:

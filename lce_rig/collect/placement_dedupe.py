@@ -1,4 +1,4 @@
-"""Check of whether the board's placement differs from those of all captures."""
+"""Check whether a board placement differs from those of all captures."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -13,14 +13,14 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.session import Capture, Session, check_capture
 
 ImageKey = tuple[str, str]
-#: Placements moved and turned by less than this count as the same.
+#: Placements moved and rotated by less than this count as the same.
 MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
 
 
 def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: float) -> NDArray[np.bool_]:
-    """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
+    """Check which of the other poses (M, 4, 4) match which of the captured poses (N, 4, 4): (N, M)."""
     way_m = np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
-    # The pattern may be read from either end.
+    # The pattern may be detected in either orientation.
     half_turn = np.diag([-1.0, -1.0, 1.0])
     R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
     turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ half_turn, R_others))
@@ -44,15 +44,15 @@ class Placements:
         self._poses[name] = poses
 
     def remove(self, name: str) -> None:
-        """Forget a capture, so that its placement counts as new."""
+        """Remove a capture, so that its placement counts as new."""
         self._poses.pop(name, None)
 
     def has_like(self, poses: Mapping[ImageKey, Array]) -> bool:
-        """Check whether the poses, for every camera, are those of one of the captures."""
+        """Check whether a capture has the same poses for every camera."""
         return any(self.are_alike(held, poses) for held in self._poses.values())
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
-        """Check whether every camera that saw both boards saw them at one place; False if none did."""
+        """Check whether every camera that detected both boards found them in one place; False if none did."""
         limits = self._min_move_m, self._min_turn_rad
         shared = one.keys() & two.keys()
         return bool(shared) and all(find_alike(one[key][None], two[key][None], *limits) for key in shared)

@@ -1,4 +1,4 @@
-"""An object in a separate process, so that its work does not hold this process's interpreter.
+"""Run an object in a separate process, so that its work does not block this process's interpreter.
 
 Threads that read sensors ask for the interpreter often and briefly; to search images for a board, or to
 calibrate, holds it for long.
@@ -17,8 +17,8 @@ from typing import Any
 
 from lce_rig.core.errors import LceRigError, SourceError
 
-# One process already has two cores' worth of work: threads of its own would only wait for each other.
-# Libraries read the number when they are loaded.
+# Thread settings of numerical libraries, read when they are loaded: this process and the worker already
+# occupy two cores, so more threads would only wait.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _CLOSE_S = 2.0
 
@@ -33,7 +33,7 @@ class Worker:
         """Prepare.
 
         Args:
-            name: of the process, for messages.
+            name: name of the process, for messages.
             make: makes the object there, before its first call; a class or function of a module.
             *arguments: its arguments.
             nice: added to the process's niceness.
@@ -44,15 +44,15 @@ class Worker:
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Worker":
-        """Start the process, and do not wait for it."""
+        """Start the process without waiting for it."""
         self._start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process at once; a call that waits raises SourceError."""
-        # A call waiting in another thread clears the process when it ends.
+        """End the process at once; a pending call raises SourceError."""
+        # A call waiting in another thread clears the process at its end.
         self._is_closed, process = True, self._process
         if process is not None:
             process.terminate()
@@ -84,7 +84,7 @@ class Worker:
         return answer
 
     def _start(self) -> None:
-        """Start a process that computes in one thread and that Ctrl-C does not reach: this one ends it."""
+        """Start a single-threaded process that ignores Ctrl-C; this process ends it."""
         if self._is_closed:
             raise SourceError(f"the process `{self._name}` was ended")
         self._connection, theirs = Pipe()
@@ -99,7 +99,7 @@ class Worker:
         self._connection.send(self._made)
 
     def _forget(self) -> None:
-        """Collect a process that has ended."""
+        """Clean up after a process that has ended."""
         process, self._process = self._process, None
         self._connection.close()
         if process is not None:

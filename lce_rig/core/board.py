@@ -28,10 +28,10 @@ class Board:
         width_m: outer width of the plate.
         height_m: outer height of the plate.
         pattern_offset_m: (x, y) of the pattern's centre from the plate's centre, frame board.
-        type: of the pattern.
+        type: type of the pattern.
         marker_share: side of a ChArUco board's markers over that of its squares.
         gap_share: gap between the tags of an AprilGrid over their side.
-        dictionary: of the markers, OpenCV's name without DICT_.
+        dictionary: dictionary of the markers, OpenCV's name without DICT_.
         first_id: of the markers, at the top left of a ChArUco board and at the lower left of an AprilGrid.
     """
 
@@ -49,7 +49,7 @@ class Board:
 
     @property
     def has_markers(self) -> bool:
-        """Whether each corner is identified, so that the pattern may be hidden in part."""
+        """Whether each corner is identified, so that part of the pattern may be hidden."""
         return self.type in ("charuco", "aprilgrid")
 
     @property
@@ -61,7 +61,7 @@ class Board:
 
     @property
     def summary(self) -> str:
-        """Name the pattern, such as "9x7 squares of 70 mm"."""
+        """Describe the pattern, such as "9x7 squares of 70 mm"."""
         if self.type == "plain":
             return f"plain plate of {self.width_m:g} x {self.height_m:g} m"
         if self.type == "aprilgrid":
@@ -70,12 +70,12 @@ class Board:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the pattern rotated by 180 deg gives the same image (squares add up to an even number)."""
+        """Whether the pattern looks the same rotated by 180 deg (rows and columns of squares sum to even)."""
         return not self.has_markers and (self.cols + self.rows) % 2 == 0
 
     @property
     def pattern_size_m(self) -> tuple[float, float]:
-        """Width and height of the print: with the outer squares, or the small ones about an AprilGrid."""
+        """Width and height of the pattern, with the outer squares, or an AprilGrid's small corner squares."""
         if self.type != "aprilgrid":
             return (self.cols + 1) * self.square_m, (self.rows + 1) * self.square_m
         gap = self.gap_share
@@ -83,7 +83,7 @@ class Board:
         return width, height
 
     def corners(self) -> Array:
-        """List the inner corners, row by row from the top left as the pattern is looked at.
+        """List the inner corners, row by row from the top left as seen by the viewer.
 
         Returns:
             (rows * cols, 3) in frame board, m.
@@ -94,14 +94,14 @@ class Board:
         return np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
 
     def _places(self, n: int) -> Array:
-        """Place n columns or rows of corners about the pattern's centre, in squares or tags."""
+        """Return the positions of n columns or rows of corners about the pattern's centre."""
         place = np.arange(n, dtype=np.float64)
         if self.type == "aprilgrid":
             place = place // 2 * (1 + self.gap_share) + place % 2
         return np.asarray(place - place[-1] / 2, dtype=np.float64)
 
     def outline(self) -> Array:
-        """List the plate's four corners, counter-clockwise from the lower left as the pattern is looked at.
+        """List the plate's four corners, counter-clockwise from the lower left as seen by the viewer.
 
         Returns:
             (4, 3) in frame board, m.
@@ -121,7 +121,7 @@ class Board:
         return midpoints, normals
 
     def nearest_edge(self, xy_m: Array) -> NDArray[np.intp]:
-        """Number the edge nearest to each point of the board's plane, in the order of `edges`.
+        """Return the index of the edge nearest to each point in the board's plane, in the order of `edges`.
 
         Beyond a corner two edges are equally near; there the bottom or the top counts.
 
@@ -138,7 +138,7 @@ class Board:
         return np.where(is_side, right_or_left, top_or_bottom).astype(np.intp)
 
     def inside_nearest_edge(self, xy_m: Array) -> Array:
-        """Measure how far points lie inside the edge that is nearest, by `nearest_edge`, m.
+        """Compute how far points lie inside the edge given by `nearest_edge`, m.
 
         Args:
             xy_m: (..., 2) x and y, frame board; further coordinates are ignored.
@@ -147,11 +147,11 @@ class Board:
         return np.where((inside_y > 0) & (inside_x < inside_y), inside_x, inside_y)
 
     def _inside(self, xy_m: Array) -> tuple[Array, Array]:
-        """Measure how far points lie inside the left or right edge, and inside the lower or upper one, m."""
+        """Compute how far points lie inside the left or right edge, and the lower or upper edge, m."""
         return self.width_m / 2 - np.abs(xy_m[..., 0]), self.height_m / 2 - np.abs(xy_m[..., 1])
 
     def outline_distance(self, xy_m: Array) -> Array:
-        """Measure how far points of the board's plane lie from the nearest point on the outline, m.
+        """Compute the distance of points in the board's plane from the outline, m.
 
         Args:
             xy_m: (..., 2) x and y, frame board; further coordinates are ignored.

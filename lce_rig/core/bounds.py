@@ -1,4 +1,4 @@
-"""Bounds on files of others: which are opened, and how many bytes of them are read, unpacked and decoded.
+"""Limits on untrusted files: file types, and bytes to read, unpack and decode.
 
 A header may promise any size. The data read or unpacked at once are bounded by the size of one image, point
 cloud or chunk of messages; readers have no limits of their own.
@@ -16,25 +16,25 @@ from typing import Any
 
 #: Largest file that is read at once, bytes: image, point cloud, result. Scans as text take 30 MB.
 MAX_BYTES = 1 << 28
-#: Largest record or unpacked chunk of a recording, bytes. Images take 60 MB at most, usual chunks 4 MB.
+#: Largest record or unpacked chunk of a recording, bytes. Images take at most 60 MB, typical chunks 4 MB.
 MAX_CHUNK_BYTES = 1 << 27
 #: Largest file of settings, bytes: YAML of this size is parsed in 2 s.
 MAX_TEXT_BYTES = 1 << 18
 # Memory for decoding one file, bytes: a whole file, and its pixels or points beside it.
 _DECODING_BYTES = 3 * (1 << 27)
-# Step of unpacking, bytes: Ctrl-C acts between two steps.
+# Step of unpacking, bytes: Ctrl-C is handled between two steps.
 _STEP_BYTES = 1 << 24
-# Ratio by which a whole recording may shrink: images and point clouds shrink to a third.
+# Largest compression ratio of a recording: images and point clouds shrink to a third.
 _MOST_SHRINKAGE = 30
 
 _decoding = threading.Lock()
 
 
 def require_file(path: Path, most_bytes: int | None = None) -> None:
-    """Refuse a device, a pipe or a socket, which have no end, and a file that is too large.
+    """Refuse devices, pipes and sockets, which have no end, and files that are too large.
 
     Args:
-        path: of a file or folder; one that is missing passes, for its reader to name.
+        path: path of a file or folder; one that is missing passes, for its reader to name.
         most_bytes: largest size; None for files that are read piece by piece.
 
     Raises:
@@ -51,7 +51,7 @@ def require_file(path: Path, most_bytes: int | None = None) -> None:
 
 
 class BoundedFile(io.BufferedReader):
-    """A file whose records are read by the lengths that they claim."""
+    """A file that bounds reads whose lengths come from its own records."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read up to `size` bytes.
@@ -76,7 +76,7 @@ class BoundedPath(type(Path())):  # type: ignore[misc]
 
 
 def unpack(decompressor: Callable[[], Any], packed: bytes, most_bytes: int = MAX_CHUNK_BYTES) -> bytes:
-    """Decompress all frames of a piece of data, step by step.
+    """Decompress all frames of a block of data, step by step.
 
     Args:
         decompressor: makes an object with the interface of `bz2.BZ2Decompressor`.
@@ -103,7 +103,7 @@ def unpack(decompressor: Callable[[], Any], packed: bytes, most_bytes: int = MAX
 
 
 class Unpacking:
-    """A compressed recording that is read unpacked, up to the size that a recording can have.
+    """A compressed recording, decompressed while reading, up to a plausible size.
 
     Args:
         source: the opened file, which reads unpacked bytes.
@@ -135,7 +135,7 @@ class Unpacking:
 
 @contextmanager
 def decoding() -> Iterator[None]:
-    """Limit the memory that decoding one file may take; one file at a time.
+    """Limit the memory used to decode a file; one file at a time.
 
     Libraries allocate as much as a header promises, before they read the data. Beyond the limit their
     allocations fail, which they report in ways of their own. Linux only; elsewhere without effect.

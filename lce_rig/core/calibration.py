@@ -136,35 +136,35 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Figures of a method and of the checks on its result; NaN for missing ones.
+    """Diagnostic figures of the method and of the checks on its result; NaN if missing.
 
     result.json keeps each under its name here.
     """
 
-    n_placements: float = math.nan  # different placements of the board among the captures used
-    held_out_m: float = math.nan  # mean over held-out captures of their rms residual
-    # Of Algorithm 1's residuals, rms over captures.
+    n_placements: float = math.nan  # number of different placements of the board among the captures used
+    held_out_m: float = math.nan  # mean rms residual of the held-out captures
+    # Algorithm 1's residuals, rms over captures.
     fit_plane_rms_m: float = math.nan
     fit_edge_rms_m: float = math.nan
-    # Parts of the standard deviations: from the scatter between captures, from errors common to all of them.
+    # Parts of the standard deviations: from the scatter between captures, and from errors common to all.
     sigma_scatter_rotation_deg: float = math.nan
     sigma_scatter_translation_m: float = math.nan
     sigma_systematic_rotation_deg: float = math.nan
     sigma_systematic_translation_m: float = math.nan
     edge_shift_m: float = math.nan  # distance of ring ends beyond the board's edges
     edge_shift_sigma_m: float = math.nan
-    # Additions to that by the background behind the board.
+    # Additional edge shift caused by the background behind the board.
     edge_shift_echo_m: float = math.nan
     edge_shift_blended_m: float = math.nan
     edge_shift_blended_echo_m: float = math.nan
-    covariance_inflation: float = math.nan  # of the joint estimate's covariance, from leave-one-out results
-    range_offset_m: float = math.nan  # mean over lasers of their range errors
-    mpe_corrected_m: float = math.nan  # Metrics.mpe_m without the LiDAR's estimated constant errors
+    covariance_inflation: float = math.nan  # of the joint covariance, from leave-one-out results
+    range_offset_m: float = math.nan  # mean range error of all lasers
+    mpe_corrected_m: float = math.nan  # Metrics.mpe_m corrected for the LiDAR's estimated errors
     laser_spread_m: float = math.nan  # standard deviation of these
     lens_vertical_m_per_rad: float = math.nan  # displacement of the LiDAR's lens
     camera_scale: float = math.nan  # of the camera's distances
     noise_range_m: float = math.nan  # of ranges
-    # Of the board's pose by the camera, beyond its corners' noise.
+    # Noise of the board's pose from the camera, not covered by corner noise.
     noise_tilt_deg: float = math.nan
     noise_spin_deg: float = math.nan
     noise_depth_m: float = math.nan
@@ -180,7 +180,7 @@ class ChannelResult:
     """One channel of a camera, with its time offset.
 
     Attributes:
-        channel: its name.
+        channel: the channel's name.
         n_captures: captures in which it shows the board and agrees with the others.
         noise_px: corner noise per coordinate, from the residuals of all its images.
         time_offset_s: correction to add to its timestamps, beyond the profile's expected offset, to reach the
@@ -197,10 +197,10 @@ class ChannelResult:
 
 @dataclass(frozen=True)
 class PointUncertainty:
-    """Errors of the LiDAR's points in the camera: standard deviations of the error's size.
+    """Standard deviations of the position error of LiDAR points transformed to the camera.
 
     Attributes:
-        distance_m: of the point from the camera.
+        distance_m: distance of the point from the camera.
         centre_px, centre_m: in the middle of the image; in it, and in space.
         corner_px, corner_m: in the least certain corner.
     """
@@ -252,10 +252,10 @@ class OtherCamera:
 
 
 class CaptureResidual(NamedTuple):
-    """How well one capture fits extrinsics.
+    """Residuals of one capture under given extrinsics.
 
     Attributes:
-        capture: its name.
+        capture: the capture's name.
         plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
         edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
         held_out_m: rms of both where the capture was not fitted; of two LiDARs by Algorithm 1, their start.
@@ -282,11 +282,11 @@ Opinion = Literal["agrees", "contradicts", "unknown"]
 
 @dataclass(frozen=True, eq=False)
 class SceneOpinion:
-    """The scene's opinion on the extrinsics of a camera and a LiDAR, without the edges at the board.
+    """The extrinsics of a camera and a LiDAR tested on the scene, without the edges at the board.
 
     Attributes:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
-        n_edges: of the scans, in or near their images.
+        n_edges: number of edges of the scans, in or near their images.
         state: whether the edges agree with the extrinsics or contradict them; unknown if undetermined.
         change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
         cov: (6, 6) of the change, that of the extrinsics included.
@@ -301,7 +301,7 @@ class SceneOpinion:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
+    """The extrinsics of one camera and one LiDAR, with all figures needed to judge them.
 
     Of two LiDARs, `camera` names the first of the profile, which has no channel: T_cam_lidar takes points
     from the second one's frame to the first's, and all axes of the camera are those of the first LiDAR. Of
@@ -311,8 +311,8 @@ class Calibration:
     result.json keeps all of it but the last three attributes, which are empty if it is read back.
 
     Attributes:
-        channels: of the camera, names.
-        lidar_channel: of a second camera; "" for a LiDAR.
+        channels: channels of the camera, names.
+        lidar_channel: channel of a second camera; "" for a LiDAR.
         channel_results: time offset and noise of each of these.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
@@ -333,14 +333,14 @@ class Calibration:
         other_cameras: those that saw the same boards held still.
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
             None for those of the profile.
-        lidar_intrinsics: of a second camera, likewise; None for a LiDAR.
+        lidar_intrinsics: intrinsics of the second camera; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
         square_m: the side of a square by the profile and the LiDAR.
         board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
-        residuals: of each capture used.
+        residuals: residuals of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
@@ -411,12 +411,12 @@ class Calibration:
 
     @property
     def is_start_certified(self) -> bool:
-        """Whether the certificate is of Algorithm 1's solution, where the estimate starts, not of its own."""
+        """Whether the certificate belongs to Algorithm 1's solution, the initial guess."""
         return self.method != "paper"
 
     @property
     def channel(self) -> str:
-        """Names of the channels for people: several are joined by "+"."""
+        """Display names of the channels, joined by "+"."""
         return "+".join(self.channels)
 
     @property
@@ -431,12 +431,12 @@ class Calibration:
 
 
 def _from_pair(pair: Any) -> Any:
-    """Read a pair of result.json, which holds the metrics side by side with the rest."""
+    """Read a pair of result.json, which stores the metrics beside the other keys."""
     return {**pair, "metrics": pair} if isinstance(pair, dict) else pair
 
 
 def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, Any]]) -> dict[str, Any]:
-    """Write a pair of result.json: the fields, and the figures that scripts read beside them."""
+    """Write a pair of result.json: the fields, and the derived figures for scripts."""
     pair: dict[str, Any] = {}
     for name, value in write(calibration).items():
         if name == "metrics":
@@ -461,9 +461,9 @@ class Provenance:
     """Origin of a result; unknown fields are empty.
 
     Attributes:
-        robot: its name, by the profile or `--robot`.
+        robot: the robot's name, from the profile or `--robot`.
         serials: serial numbers by sensor, reported by the devices during the collection, else the profile's.
-        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
+        date: date of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
             without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
         imported: when the last capture came into the session, in the same form; only where `date` is None.
@@ -477,7 +477,7 @@ class Provenance:
 
     @property
     def date_words(self) -> str:
-        """The date, or "unknown, imported on 2026-11-23" for a recording without times; "" for neither."""
+        """The date, or "unknown, imported on 2026-11-23" for a recording without times; "" without both."""
         return self.date or (f"unknown, imported on {self.imported[:10]}" if self.imported else "")
 
 
@@ -486,7 +486,7 @@ class SensorPose:
     """The pose of a sensor on the rig's base sensor.
 
     Attributes:
-        sensor: its name.
+        sensor: the sensor's name.
         T_base_sensor: (4, 4) p_base = R p_sensor + t; of a camera, of its optical frame.
         sigma_rotation_deg, sigma_translation_m: roots of the summed variances.
         verdict: the worst of the pairs that the pose is composed of; never "fail".
@@ -517,7 +517,7 @@ class ResultFile:
     """result.json.
 
     Attributes:
-        rig: its name.
+        rig: the rig's name.
         made_by: the program and its version.
         provenance: robot, sensors and date.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
@@ -535,7 +535,7 @@ class ResultFile:
     pairs: tuple[Annotated[Calibration, BeforeValidator(_from_pair), WrapSerializer(_as_pair)], ...]
 
     def document(self) -> dict[str, Any]:
-        """List the content as plain types, keys in a fixed order; figures that are not known are null.
+        """Return the content as plain types with keys in a fixed order; unknown figures are null.
 
         Raises:
             ResultRefusedError: a pose or covariance is not finite.
@@ -559,7 +559,7 @@ class ResultFile:
         return document
 
     def text(self) -> str:
-        """Write the content: the same result gives the same bytes; floats with all digits, a row per line.
+        """Return the content as text, reproducible byte for byte: floats with all digits, one row per line.
 
         Raises:
             ResultRefusedError: a pose or covariance is not finite.
@@ -587,7 +587,7 @@ def _layout(value: Any, indent: str) -> str:
 
 
 def read_result(path: Path | str) -> ResultFile:
-    """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
+    """Read result.json exactly as written; keys added by later versions are ignored.
 
     Raises:
         SessionError: no such file, or not a valid result; with the key at fault.

@@ -1,4 +1,4 @@
-"""Camera models: pixels from points and rays from pixels, with their range of validity."""
+"""Camera models: project points, and unproject pixels, with the models' range of validity."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -170,7 +170,7 @@ class Intrinsics:
         return self._bend(points_camera, rho, np.arctan2(rho, z))
 
     def _bend(self, points: Array, rho: Array, angle: Array) -> Array:
-        """Distort points (..., 3) by their distance from the axis and angle to it (equidistant only)."""
+        """Distort points (..., 3) by their distance from the axis and their angle (equidistant only)."""
         with np.errstate(all="ignore"):
             scale = np.where(rho > 1e-12, self._distorted_radius(angle) / rho, 1.0 / points[..., 2])
         return np.asarray(points[..., :2] * scale[..., None])
@@ -205,7 +205,7 @@ class Intrinsics:
         return np.asarray(slope * np.array([self.fx_px, self.fy_px])[:, None])
 
     def unproject(self, pixels: NDArray[Any]) -> Array:
-        """Find the unit ray through each pixel, by Newton's method.
+        """Return the unit ray through each pixel, by Newton's method.
 
         Args:
             pixels: (..., 2).
@@ -254,7 +254,7 @@ class Intrinsics:
 
 
 def _shorten(model: str, distortion: tuple[float, ...]) -> tuple[float, ...] | None:
-    """Drop zeros behind the coefficients of a model; None if no model here has as many coefficients."""
+    """Drop trailing zeros of the coefficients; None if no supported model has that many."""
     n, n_used = len(distortion), len(np.trim_zeros(np.array(distortion), "b"))
     if model in ("", "none"):
         return () if n_used == 0 else None

@@ -40,7 +40,7 @@ class Image:
         """The image as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
         if self.pixels.ndim == 2:
             return self.pixels
-        import cv2  # Slow to import, and unusable to commands that look at no image.
+        import cv2  # Slow to import, and not needed by commands without images.
 
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
@@ -70,7 +70,7 @@ class Scan:
     range_offset_m: float = 0.0
 
     def corrected(self, range_offset_m: float) -> "Scan":
-        """Subtract a constant from all ranges of a scan as recorded, along each ray from the origin.
+        """Subtract a constant from all recorded ranges of a scan, along each ray from the origin.
 
         A scan corrected by the same offset is returned unchanged, so that it is not subtracted twice.
         Returns not beyond the offset are dropped.
@@ -160,7 +160,7 @@ _Stretch = TypeVar("_Stretch", Events, EventColumns)
 
 
 def join_events(parts: Sequence[_Stretch]) -> _Stretch:
-    """Join ranges of one camera's stream, at least one, in order of time."""
+    """Join ranges of one camera's stream (at least one) in order of time."""
     filled = [part for part in parts if len(part)] or parts[:1]
     if len(filled) == 1:
         return filled[0]
@@ -175,7 +175,7 @@ def join_events(parts: Sequence[_Stretch]) -> _Stretch:
 
 @dataclass(frozen=True)
 class Pulse:
-    """One edge that a trigger line made or a sensor saw.
+    """An edge sent on a trigger line or detected by a sensor.
 
     Attributes:
         sensor: name of the line: a camera that it triggers, or the sensor that saw it.
@@ -196,7 +196,7 @@ class Stream:
 
     Attributes:
         sensor: the camera or LiDAR.
-        channel: of a camera; "" for a LiDAR.
+        channel: channel of a camera; "" for a LiDAR.
         kind: a channel of events may also bring images that others reconstructed.
     """
 

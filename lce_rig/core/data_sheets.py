@@ -1,4 +1,4 @@
-"""Published figures of LiDARs: beams, timing, noise. The only place with such figures.
+"""Data sheet figures of LiDARs: beams, timing, noise. No other module contains such figures.
 
 The table is `data_sheets.json`, an object of `DataSheet`'s attributes for each model. The simulator, the
 guidance, a profile's defaults and `lce-rig rigs new` read it. Every entry names its sources and its
@@ -16,7 +16,7 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 
-# Angle between neighbouring lines and returns of a LiDAR without rings, deg, for guidance's predictions.
+# Angle between neighbouring lines and returns of a LiDAR without rings, deg, for the guidance's predictions.
 _LINE_DEG = 0.5
 
 
@@ -27,14 +27,14 @@ class DataSheet:
     Attributes:
         name: the maker's.
         source: where the figures are from.
-        elevations_deg: of each laser, in firing order; empty without rings.
+        elevations_deg: elevations of each laser, in firing order; empty without rings.
         sequence_ns: time between two firings of one laser; None where the maker fixes `columns` instead.
         columns: firings of each laser per revolution, if they do not depend on the rate.
         firing_ns: time between two groups of lasers of one sequence.
         n_at_once: lasers that fire together.
         azimuths_deg: of each laser from the rotor's, towards growing azimuth (Velodyne and Hesai count the
             other way); empty for none.
-        heights_mm: of each laser's optical centre; empty for none.
+        heights_mm: height of each laser's optical centre; empty for none.
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
         range_m: nearest and farthest return.
         rates_hz: slowest and fastest revolutions per second.
@@ -83,7 +83,7 @@ class DataSheet:
 
     @property
     def has_rings(self) -> bool:
-        """Whether its beams sweep cones about its axis."""
+        """Whether the beams sweep cones about the LiDAR's axis."""
         return self.pattern == "rings"
 
     @property
@@ -103,7 +103,7 @@ class DataSheet:
         return np.asarray(np.radians(np.sort(self.elevations_deg)))
 
     def step_rad(self, rate_hz: float) -> float:
-        """Return the rotor's turn between two firings of one laser."""
+        """Return the rotor's rotation between two firings of one laser."""
         if not self.has_rings:
             return float(np.radians(_LINE_DEG))
         if self.sequence_ns is None:
@@ -111,7 +111,7 @@ class DataSheet:
         return 2 * np.pi * self.sequence_ns * 1e-9 * rate_hz
 
     def with_rings(self, elevations_deg: tuple[float, ...] | None, columns: int | None) -> "DataSheet":
-        """Exchange the beams for those of a single unit; None keeps the model's."""
+        """Replace the beams by those of an individual unit; None keeps the model's."""
         sheet = self
         if elevations_deg is not None:
             sheet = replace(sheet, elevations_deg=elevations_deg, azimuths_deg=(), heights_mm=())
@@ -133,7 +133,7 @@ TYPICAL = DataSheet(name="other", source="typical of spinning LiDARs", elevation
 
 
 def find_data_sheet(model: str) -> DataSheet | None:
-    """Find a model by its name in any spelling; None if it is not known.
+    """Find a model by name in any spelling; None if unknown.
 
     "VLP-16", "vlp16" and "Velodyne VLP 16 (Puck)" are one model; words behind a known name do not matter.
     """

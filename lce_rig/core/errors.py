@@ -59,8 +59,8 @@ class NotEnoughDataError(LceRigError):
     """Too few captures, or captures that leave a direction undetermined.
 
     Args:
-        what: as of every error.
-        hint: as of every error.
+        what: as in every error.
+        hint: as in every error.
         finding: the same as code and figures, where a calibration lacks captures.
     """
 
@@ -72,7 +72,7 @@ class NotEnoughDataError(LceRigError):
 
     @staticmethod
     def of(finding: Finding) -> "NotEnoughDataError":
-        """Make the error that names the missing data and their sensor."""
+        """Return the error that names the missing data and their sensor."""
         subject, advice = f"{finding.subject}: " if finding.subject else "", finding.advice
         # Several causes, a line each, do not form a sentence.
         return NotEnoughDataError(
@@ -87,13 +87,13 @@ class ResultRefusedError(LceRigError):
 
 
 class TargetError(LceRigError):
-    """A target of a deployment that cannot be reached or written; it holds a whole set of files."""
+    """A deployment target that cannot be reached or written; it still holds a complete set of files."""
 
     exit_code = 8
 
 
 class CommandError(LceRigError):
-    """The command after a deployment failed; the new files are in place."""
+    """The command run after a deployment failed; the new files are in place."""
 
     exit_code = 9
 
@@ -102,7 +102,7 @@ class CommandError(LceRigError):
 def reading(
     path: Path | str, kind: type[LceRigError] = SourceError, hint: str = "", most_bytes: int | None = None
 ) -> Iterator[None]:
-    """Turn any failure to read a file into one error that names the file.
+    """Convert any failure to read a file into one error that names the file.
 
     Devices, pipes and files that are too large are refused before they are opened.
 
@@ -112,7 +112,7 @@ def reading(
 
     Args:
         path: the file, or words for the message.
-        kind: of the error.
+        kind: kind of the error.
         hint: an action against content that is damaged or of another kind.
         most_bytes: largest size of a file that is read at once.
     """
@@ -135,7 +135,7 @@ def reading(
 def _is_bug(error: Exception) -> bool:
     """Check whether an error comes from a bug in the program rather than from a file."""
     if isinstance(error, AttributeError):
-        # Values of files have types of Python and NumPy.
+        # Contents of files have types of Python and NumPy.
         owner = error.obj if isinstance(error.obj, ModuleType | type) else type(error.obj)
         home = owner.__name__ if isinstance(owner, ModuleType) else owner.__module__
         return home.partition(".")[0] == __package__.partition(".")[0]
@@ -143,7 +143,7 @@ def _is_bug(error: Exception) -> bool:
 
 
 def _raised_here(error: Exception) -> bool:
-    """Check whether code of this package raised an error, not a library's."""
+    """Check whether this package, not a library, raised an error."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -152,7 +152,7 @@ def _raised_here(error: Exception) -> bool:
 
 
 def reason_of(error: Exception) -> str:
-    """Describe an error of a library in one short, printable line."""
+    """Describe a library's error in one short, printable line."""
     text = str(error.strerror or error) if isinstance(error, OSError) else str(error)
     text = " ".join(text.encode(errors="replace").decode().split())
     text = "".join(character for character in text if character.isprintable())
@@ -164,7 +164,7 @@ def reason_of(error: Exception) -> str:
 
 
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
-    """Make one error of at least one: the first, with the others in its hint."""
+    """Merge one or more errors: the first, with the others in its hint."""
     first, *others = errors
     hint = "\n".join([first.hint, *map(str, others)]).strip()
     return NotEnoughDataError(first.what, hint, first.finding)
@@ -176,10 +176,10 @@ _ERRORS: dict[Stage, Kind] = {
 
 
 def refusal_of(stage: Stage, error: LceRigError, otherwise: str = "collect this placement again") -> Refusal:
-    """Refuse a capture for an error that was raised about it.
+    """Return the refusal of a capture for an error raised about it.
 
     Args:
-        stage: of the error.
+        stage: stage of the error.
         error: the cause.
         otherwise: the action for unreadable data, if the error names none.
     """

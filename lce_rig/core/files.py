@@ -13,7 +13,7 @@ from lce_rig.core.data import Events
 
 _EVENTS_VERSION = 1
 _NS_PER_US = 1000
-# The same events, the same bytes: no time of writing goes into the archive.
+# Fixed time in the archive, so that the same events give the same bytes.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -89,8 +89,8 @@ def encode_events(events: Events) -> bytes:
     if events.host_ns is not None:
         columns["host_ns"] = np.array(events.host_ns)
     buffer = io.BytesIO()
-    # A capture must not wait: NumPy's own compression is seven times slower and 5 % smaller; to compress the
-    # pixels' columns takes most of the time, and they hardly shrink.
+    # Captures must be written fast: NumPy's own compression is seven times slower and only 5 % smaller.
+    # Compressing the pixel columns takes most of the time and hardly reduces them.
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, column in columns.items():
             plain = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Facts about a sensor, a capture or a result, and their words.
+"""Facts about a sensor, a capture or a result, and their texts.
 
 A kind of finding is declared once, as a `Kind` in `findings.py` of the room that makes it:
 
@@ -80,7 +80,7 @@ class Finding:
     """One fact with its figures.
 
     Attributes:
-        code: of its kind, "family.name".
+        code: code of its kind, "family.name".
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
         figures: by name with units ("rms_m"), for the words and for programs.
@@ -99,7 +99,7 @@ class Finding:
 
     @property
     def family(self) -> str:
-        """The part of the code before the point."""
+        """Part of the code before the dot."""
         return self.code.partition(".")[0]
 
     def figure(self, name: str) -> float:
@@ -116,19 +116,19 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """The fact in words, without an action."""
+        """The fact as text, without an action."""
         return self.stored[0] if self.stored else self._render(KINDS[self.code].text)
 
     @property
     def advice(self) -> str:
-        """The action in words; "" for none."""
+        """The action as text; "" if there is none."""
         if self.stored:
             return self.stored[1]
         kind = KINDS[self.code]
         return self._render(kind.actions[self.action] if self.action else kind.action)
 
     def advice_at(self, session: str) -> str:
-        """Return the action in words, with the path of the session for which its commands are."""
+        """Return the action as text, with the path of the session in its commands."""
         placed = replace(self, figures={**self.figures, "session": shlex.quote(session)}, stored=None)
         try:
             return placed.advice
@@ -142,7 +142,7 @@ class Finding:
         return f"{self.text}: {advice}" if advice else self.text
 
     def as_json(self) -> dict[str, object]:
-        """Return the finding for programs; all but the texts is stable."""
+        """Return the finding as JSON; all fields but the texts are stable."""
         return {
             "code": self.code,
             "severity": self.severity,
@@ -162,7 +162,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Refusal(Finding):
-    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
+    """The reason for refusing a capture; its code begins with the stage, such as "lidar.too_few_rings".
 
     Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
     """
@@ -177,19 +177,19 @@ class Refusal(Finding):
         return cast(Stage, self.family)
 
     def as_json(self) -> dict[str, object]:
-        """Return the refusal for programs; stage, code, figures and the action's code are stable."""
+        """Return the refusal as JSON; stage, code, figures and the action's code are stable."""
         record = super().as_json()
         kept = {name: record[name] for name in ("code", "figures", "action_code")}
         return {"stage": self.stage, **kept, "cause": record["text"], "action": record["action"]}
 
 
 def worst(findings: Iterable[Finding]) -> Severity:
-    """Return the highest severity; "note" without findings."""
+    """Return the highest severity; "note" if there are no findings."""
     return max((finding.severity for finding in findings), key=_ORDER.index, default="note")
 
 
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """List findings, the worst first, otherwise in the order given."""
+    """Sort findings by severity, the worst first; equal ones keep their order."""
     return tuple(sorted(findings, key=lambda finding: -_ORDER.index(finding.severity)))
 
 
@@ -202,17 +202,17 @@ def _finite(figure: Figure) -> Figure:
 
 @dataclass
 class Losses:
-    """Findings counted by code, subject and action; those that differ in their figures only are one kind."""
+    """Findings counted by code, subject and action; their figures do not matter."""
 
     _counts: Counter[tuple[str, str, str]] = field(default_factory=Counter)
     _examples: dict[tuple[str, str, str], Finding] = field(default_factory=dict)
 
     def add(self, finding: Finding, n: int = 1, *, is_best: bool = False) -> None:
-        """Count more of a kind.
+        """Add to the count of a finding's kind.
 
         Args:
-            finding: one of them.
-            n: how many.
+            finding: an example of the kind.
+            n: number to add.
             is_best: keep this one's figures as the example, instead of those of the first.
         """
         if n <= 0:
@@ -228,13 +228,13 @@ class Losses:
             self.add(finding, n)
 
     def keep_more(self, other: "Losses") -> None:
-        """Take over larger counts from a more complete pass over the same data."""
+        """Adopt larger counts from a more complete pass over the same data."""
         for kind, n in other._counts.items():
             if n >= self._counts[kind]:
                 self._counts[kind], self._examples[kind] = n, other._examples[kind]
 
     def counts(self) -> list[tuple[Finding, int]]:
-        """List an example of each kind with how many there were, most frequent first."""
+        """List an example of each kind with its count, most frequent first."""
         return [(self._examples[kind], n) for kind, n in self._counts.most_common()]
 
     def by_code(self) -> dict[str, int]:

@@ -78,7 +78,7 @@ def project_to_so3(A: Array) -> Array:
 
 
 def rotation_angle(R_1: Array, R_2: Array) -> Array:
-    """Measure the angle between two rotations in rad, accurate for tiny angles.
+    """Compute the angle between two rotations in rad, accurate for tiny angles.
 
     Args:
         R_1: (..., 3, 3).
@@ -98,7 +98,7 @@ def pose(R: Array, t: Array) -> Array:
 
 
 def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
-    """Build a pose from a value in a document: four lists of four numbers.
+    """Build a pose from parsed text: four lists of four numbers.
 
     Args:
         value: as read, of any type.
@@ -130,7 +130,7 @@ def invert(T_a_b: Array) -> Array:
 
 
 def transform(T_a_b: Array, points_b: NDArray[Any]) -> Array:
-    """Take points from frame b to frame a: p_a = R p_b + t.
+    """Transform points from frame b to frame a: p_a = R p_b + t.
 
     Args:
         T_a_b: (..., 4, 4).
@@ -157,7 +157,7 @@ def difference(T_1: Array, T_2: Array) -> Array:
 
 
 def tangent_sizes(tangent: Array) -> tuple[float, float]:
-    """Measure the angle in deg and the distance in m of a tangent (6,)."""
+    """Compute the angle in deg and the distance in m of a tangent (6,)."""
     return float(np.degrees(np.linalg.norm(tangent[3:]))), float(np.linalg.norm(tangent[:3]))
 
 
@@ -217,12 +217,12 @@ class PoseDifference:
 
     @property
     def chance(self) -> float:
-        """Probability of a difference this large or larger if both are right."""
+        """Probability of a difference this large or larger if the poses are equal."""
         return chance_of(self.chi2, 6)
 
     @property
     def is_significant(self) -> bool:
-        """Whether chance alone makes it so large in 1 % of cases at most."""
+        """Whether a difference this large occurs by chance in at most 1 % of cases."""
         return self.chi2 > _SURPRISING_CHI2
 
     @property
@@ -233,7 +233,7 @@ class PoseDifference:
 
 
 def shortened(points: NDArray[Any], by_m: float) -> Array:
-    """Move points (N, 3) towards the origin along their rays; one at the origin becomes NaN."""
+    """Shorten points (N, 3) along their rays towards the origin; one at the origin becomes NaN."""
     points = np.asarray(points, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(points * (1 - by_m / np.linalg.norm(points, axis=1))[:, None])
@@ -266,7 +266,7 @@ def mean_pose(
     T_start: Array | None = None,
     weigh: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array]:
-    """Find the pose of least sum_k w_k x_k^T W_k x_k, with x_k the tangent from it to pose k.
+    """Find the pose with minimum sum_k w_k x_k^T W_k x_k, where x_k is the tangent from it to pose k.
 
     Args:
         T: (K, 4, 4).
@@ -293,7 +293,7 @@ def mean_pose(
 
 
 def student_weights(chi2: Array) -> Array:
-    """Weight poses (K,) for `mean_pose` by their squared distances from the mean, as some may be outliers."""
+    """Compute robust weights of poses (K,) for `mean_pose` from their squared distances from the mean."""
     return np.asarray((_STUDENT + 6) / (_STUDENT + chi2))
 
 
@@ -335,7 +335,7 @@ def relative_covariance(J: Array, cov_second: Array, cov_first: Array) -> Array:
     Args:
         J: (..., 6, 12) derivatives from there.
         cov_second: (..., 6, 6) of the second pose.
-        cov_first: of the first.
+        cov_first: covariance of the first pose.
     """
     by_second, by_first = J[..., :6], J[..., 6:]
     return np.asarray(

@@ -24,7 +24,7 @@ _SCREEN_AS_BEFORE = b"\x1b[?1049l\x1b[?25h"
 
 
 class _InterruptWatch:
-    """Ends the process if Ctrl-C has not, after a grace period or at the second press."""
+    """Ends the process after a grace period, or at the second Ctrl-C, if it is still running."""
 
     def __init__(self) -> None:
         self.grace_s = GRACE_S
@@ -33,7 +33,7 @@ class _InterruptWatch:
         self._settings: list[Any] | None = None
         with suppress(termios.error, OSError, ValueError, AttributeError):
             self._settings = termios.tcgetattr(sys.stdin)
-        # Python runs its handlers between two steps of the main thread only; this is written at once.
+        # Python runs its handlers only between two steps of the main thread; this pipe is written at once.
         self._pressed, told = os.pipe()
         os.set_blocking(told, False)
         signal.set_wakeup_fd(told, warn_on_full_buffer=False)
@@ -115,7 +115,7 @@ def patience(grace_s: float) -> Iterator[None]:
 
 @contextmanager
 def without_interrupt() -> Iterator[None]:
-    """Let Ctrl-C wait until the block's end, for imports of compiled libraries.
+    """Delay Ctrl-C until the end of the block, for imports of compiled libraries.
 
     Stopped in their initialisation they end the process in ways of their own: Open3D by an exit code,
     onnxruntime by an abort.

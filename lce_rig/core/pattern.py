@@ -1,4 +1,4 @@
-"""The pattern of a board: its dark points, and the places of its markers."""
+"""The pattern of a board: its black areas, and the positions of its markers."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -98,7 +98,7 @@ def n_markers_of(dictionary: str) -> int:
 
 
 def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
-    """Find which points (..., 2) of the board's plane are printed black.
+    """Find which points (..., 2) in the board's plane are printed black.
 
     The outer square at the top left of a checkerboard or ChArUco board is black. The squares between an
     AprilGrid's tags make every corner of a tag a crossing.
@@ -109,7 +109,7 @@ def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
     """
     if board.type == "plain":
         return np.zeros(xy_m.shape[:-1], dtype=np.bool_)
-    # From the upper left end of the print, right and down.
+    # Position right and down from the pattern's upper left corner.
     width_m, height_m = board.pattern_size_m
     right = (xy_m[..., 0] - board.pattern_offset_m[0] + width_m / 2) / board.square_m
     down = (board.pattern_offset_m[1] - xy_m[..., 1] + height_m / 2) / board.square_m
@@ -134,7 +134,7 @@ def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
 
 
 def dark_rectangles(board: Board) -> Array:
-    """List the dark parts of the print as (K, 4) left, lower, width and height, frame board, m."""
+    """List the black parts of the pattern as (K, 4) left, lower, width and height, frame board, m."""
     s, (x0, y0) = board.square_m, board.pattern_offset_m
     width_m, height_m = board.pattern_size_m
     left, upper = x0 - width_m / 2, y0 + height_m / 2
@@ -164,7 +164,7 @@ def dark_rectangles(board: Board) -> Array:
 
 
 def _in_marker(board: Board, cells: tuple[Array, Array], places: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Find which places (0..1 right and down in the marker of a cell) are black."""
+    """Find which positions (0..1 right and down in the marker of a cell) are black."""
     markers = markers_of(board)
     table = np.full((board.rows + 2, board.cols + 2), -1)
     table[markers.cells[:, 1], markers.cells[:, 0]] = np.arange(len(markers.ids))

@@ -1,4 +1,4 @@
-"""Point clouds as PCD files of any writer.
+"""Point clouds as PCD files from any writer.
 
 Headers are read as PCL reads them: any white space separates fields, and COUNT and POINTS may be missing.
 pypcd4 refuses such files, and reserves memory for as many points as a header promises.
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _MAX_HEADER_BYTES = 1 << 16
-# Points of several megabytes per cloud are usual; more fields than this are none.
+# Maximum number of values per point: megabytes per point cloud are common, more fields than this are an
+# error.
 _MAX_VALUES = 1024
 # LZF writes at most 264 bytes for 3.
 _MAX_EXPANSION = 88
@@ -30,7 +31,7 @@ class _Header:
     """The header of a PCD file.
 
     Attributes:
-        dtype: of a point in the file, padding and repeated names included.
+        dtype: dtype of a point in the file, padding and repeated names included.
         kept: names of the fields that are read, with their names in `dtype`.
         n_points: as promised.
         encoding: "ascii", "binary" or "binary_compressed".
@@ -70,7 +71,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
 
 
 def _split(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Split a file into the entries of its header and the bytes behind its line DATA."""
+    """Split a file into its header's entries and the bytes after the DATA line."""
     file, entries = io.BytesIO(data), dict[str, list[str]]()
     while file.tell() < _MAX_HEADER_BYTES and (line := file.readline(_MAX_HEADER_BYTES)):
         # Comments need not be UTF-8; MATLAB's hold a trade mark sign.
@@ -117,7 +118,7 @@ def _parse(entries: dict[str, list[str]]) -> _Header:
 
 
 def _numbers(entries: dict[str, list[str]], key: str, n: int) -> list[int]:
-    """Read the whole numbers of an entry.
+    """Read the integers of an entry.
 
     Raises:
         ValueError: it is missing, or has other than n.
@@ -142,7 +143,7 @@ def _read_ascii(body: bytes, header: _Header) -> NDArray[Any]:
     try:
         rows = _load_rows(body, header.dtype, n_values, header.n_points)
     except ValueError:
-        # Some writers print whole numbers with a point.
+        # Some writers print integers with a decimal point.
         try:
             values = _load_rows(body, np.dtype(np.float64), n_values, header.n_points)
         except ValueError:
@@ -159,7 +160,7 @@ def _read_ascii(body: bytes, header: _Header) -> NDArray[Any]:
 
 
 def _load_rows(body: bytes, dtype: np.dtype[Any], n_values: int, n_rows: int) -> NDArray[Any]:
-    """Load up to n rows of numbers; like PCL, ignoring values beyond a row's fields."""
+    """Load up to n rows of numbers; like PCL, ignore values beyond a row's fields."""
     lines = (line for line in io.StringIO(body.decode("ascii", errors="replace")) if not line.isspace())
     ndmin: Literal[1, 2] = 1 if dtype.names else 2
     return np.asarray(np.loadtxt(lines, dtype, ndmin=ndmin, usecols=range(n_values), max_rows=n_rows))
@@ -175,7 +176,7 @@ def _read_compressed(body: bytes, header: _Header) -> NDArray[Any]:
         return np.empty(0, header.dtype)
     if len(body) < 8:
         raise ValueError("it is truncated: no points are there")
-    import lzf  # Commands that read no point cloud need not wait for it.
+    import lzf  # Import here: commands without point clouds need not wait for it.
 
     n_packed, n_bytes = struct.unpack_from("<II", body)
     there, n_needed = body[8 : 8 + n_packed], header.n_points * header.dtype.itemsize
@@ -198,7 +199,7 @@ def _read_compressed(body: bytes, header: _Header) -> NDArray[Any]:
 
 
 def encode_pcd(cloud: NDArray[Any], comments: Iterable[str] = ()) -> bytes:
-    """Encode a point cloud as binary PCD, `decode_pcd`'s inverse.
+    """Encode a point cloud as binary PCD, the inverse of `decode_pcd`.
 
     Args:
         cloud: structured (N,) of scalar fields.

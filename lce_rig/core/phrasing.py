@@ -1,4 +1,4 @@
-"""Figures printed with their units, in templates."""
+"""Figures formatted with their units, in templates."""
 
 import math
 import re
@@ -58,7 +58,7 @@ _CAMERA_AXES = {"x": "x axis (right)", "y": "y axis (down)", "z": "z axis (line 
 
 
 def motion_words(motion: str) -> str:
-    """Name a motion by its code, "translation_x" to "rotation_z"; other text is returned unchanged."""
+    """Return a motion's name for its code, "translation_x" to "rotation_z"; other text is unchanged."""
     kind, _, axis = motion.partition("_")
     if axis not in _CAMERA_AXES:
         return motion
@@ -66,7 +66,7 @@ def motion_words(motion: str) -> str:
 
 
 def fill(template: str, figures: Mapping[str, Any]) -> str:
-    """Fill in figures; one that differs from its limit is printed with as many digits as show it.
+    """Fill in figures, with enough digits to distinguish a figure from its limit.
 
     {change:size} prints an angle change_deg or a length change_m, whichever is there; {change:+1size} has a
     sign, and a digit more in mm.
@@ -101,7 +101,7 @@ def _sized(name: str | None, spec: str, figures: Mapping[str, Any]) -> tuple[str
 
 
 def _more_digits(figure: tuple[float, str], limit: tuple[float, str]) -> int:
-    """Count the digits that two figures with their specs lack to print differently; 0 if they are equal."""
+    """Count the digits to add so that two figures print differently; 0 if they are equal."""
     for more in range(_MOST_DIGITS if figure[0] != limit[0] else 0):
         first, second = (_format(*each, more).split()[0] for each in (figure, limit))
         if "unknown" in (first, second) or float(first) != float(second):
@@ -110,7 +110,7 @@ def _more_digits(figure: tuple[float, str], limit: tuple[float, str]) -> int:
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Print a figure for people with significant digits and without an exponent: 110, not 1.1e+02."""
+    """Format a figure with significant digits and without an exponent: 110, not 1.1e+02."""
     text = f"{value:.{digits}g}"
     if "e" not in text:
         return text
@@ -118,12 +118,12 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def sizes(rotation_deg: float, translation_m: float) -> str:
-    """Write the size of a motion, or its standard deviation."""
+    """Format the size of a motion, or its standard deviation."""
     return f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
 
 
 def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
-    """Say how many captures to add, where to stand and how to tilt the board.
+    """Describe how many captures to add, where to stand and how to tilt the board.
 
     Args:
         n_captures: in all.
@@ -138,5 +138,5 @@ def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
 
 
 def as_line(text: str) -> str:
-    """Write words as a sentence, with a capital and a full stop."""
+    """Format text as a sentence, with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."

@@ -73,7 +73,7 @@ def solve_planar_pose(
     centre_board = corners_board.mean(axis=0)
     other = starts[1] if len(starts) > 1 else mirror_tilt(first[0], centre_board)
     second = refine_pose(other, corners_px, corners_board, intrinsics)
-    # A poor homography may lead to neither minimum; mirroring the second one back shows whether it did.
+    # A poor homography may lead to neither minimum; mirror the second one back to find out.
     back = mirror_tilt(second[0], centre_board)
     if second[1] < first[1] and rotation_angle(back[:3, :3], first[0][:3, :3]) > 0.2:
         third = refine_pose(back, corners_px, corners_board, intrinsics)
@@ -85,7 +85,7 @@ def solve_planar_pose(
     n = len(corners_px)
     variance = max(cost / max(2 * n - 6, 1), 1e-12)
     sigma_px = float(np.sqrt(variance))
-    # Both starts may end at one pose; distinct poses differ by far more.
+    # Both starts may converge to one pose; distinct poses differ by far more.
     is_same = bool(rotation_angle(T[:3, :3], T_other[:3, :3]) < 1e-3)
     has_other = np.isfinite(cost_other) and not is_same
     return PlanarPose(
@@ -117,7 +117,7 @@ def pose_covariance(
 def refine_pose(
     T_cam_board: Array, corners_px: Array, corners_board: Array, intrinsics: Intrinsics
 ) -> tuple[Array, float]:
-    """Minimise the reprojection error of one board, as `refine_poses`.
+    """Minimise the reprojection error of one board; see `refine_poses`.
 
     Returns:
         T_cam_board (4, 4) at the minimum and its cost in px^2, infinite where the start projects nowhere.
@@ -129,7 +129,7 @@ def refine_pose(
 def refine_poses(
     T_cam_board: Array, corners_px: Array, corners_board: Array, project: Project
 ) -> tuple[Array, Array]:
-    """Minimise the reprojection errors of K boards, each alone, by Levenberg-Marquardt.
+    """Minimise the reprojection errors of K independent boards by Levenberg-Marquardt.
 
     Args:
         T_cam_board: (K, 4, 4) to start from.
@@ -228,7 +228,7 @@ def linearise_poses(
     The derivative of a point by the tangent is [I, -(R p)^]. Both are zero for hidden corners.
 
     Args:
-        T_cam_board, corners_px, corners_board, project: as of `refine_poses`.
+        T_cam_board, corners_px, corners_board, project: as in `refine_poses`.
     """
     turned = corners_board @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
     pixels, by_point = project(turned + T_cam_board[:, None, :3, 3])
@@ -239,7 +239,7 @@ def linearise_poses(
 
 
 def _checked(intrinsics: Intrinsics) -> Project:
-    """Project with NaN where the camera's model does not hold."""
+    """Project points; NaN outside the camera model's range of validity."""
     return lambda points: (intrinsics.project(points)[0], intrinsics.differentiate(points))
 
 

@@ -1,4 +1,4 @@
-"""Reports of how far a piece of work is."""
+"""Progress reports."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ def silent(done: int, total: int) -> None:
 
 
 def begin(progress: Progress, step: str) -> None:
-    """Name the step that begins; the next (done, total) are its own."""
+    """Name the next step, to which the following (done, total) belong."""
     show_step = getattr(progress, "begin", None)
     if show_step is not None:
         show_step(step)

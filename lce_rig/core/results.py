@@ -1,4 +1,4 @@
-"""Boards as detected in images and scans, and the observations made of them."""
+"""Boards detected in images and scans, and the observations made from them."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ class ImageQuality:
     Attributes:
         contrast: white minus black squares, grey values.
         square_px: shortest side of a square; 0 if no two neighbours are visible.
-        edge_width_px: of the squares' edges, 10-90 %.
+        edge_width_px: width of the squares' edges, 10-90 %.
         sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
         border_px: distance of the outermost corner from the border of the image.
         n_corners: number of fitted corners.
@@ -34,7 +34,7 @@ class ImageQuality:
 
 @dataclass(frozen=True)
 class EventQuality:
-    """Figures of the board and its motion in events; NaN if not measured.
+    """Figures of the board and its motion from events; NaN if not measured.
 
     Attributes:
         events_px_s: events per second and pixel of the board, just before the image.
@@ -64,10 +64,10 @@ class LidarQuality:
         n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
         n_ring_ends_dropped: those that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
-        edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
+        edge_rms_m: rms of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
         beyond_share: returns in the plane beyond the outline over those on the plate.
-        distance_m: of the plate's middle.
+        distance_m: distance of the plate's middle.
     """
 
     width_m: float
@@ -87,7 +87,7 @@ class LidarQuality:
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """The board's pose in the frame of the first of two sensors: of a camera, or of a LiDAR.
+    """The board's pose in the frame of the first of two sensors, a camera or a LiDAR.
 
     Attributes:
         T_cam_board: (4, 4), the likeliest pose.
@@ -128,7 +128,7 @@ class ImageBoard(BoardPose):
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
         events: figures of the board's events; None if the image was not reconstructed from known events.
-        stamp_ns: of the image; None if the recording carries no time.
+        stamp_ns: timestamp of the image; None if the recording carries no time.
         track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
             the board was tracked; None if there are none.
         track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
@@ -196,7 +196,7 @@ class LidarBoard(BoardSurface):
         sigma_m: rms distance of `points` from the plane.
         offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
         quality: figures of the plate in the scan.
-        stamp_ns: of the scan; None if the recording carries no time.
+        stamp_ns: timestamp of the scan; None if the recording carries no time.
     """
 
     ring: NDArray[np.int16]
@@ -214,7 +214,7 @@ class LidarBoard(BoardSurface):
     edge_sigma_m: Array | None = None
 
     def corrected(self, range_offset_m: float) -> "LidarBoard":
-        """Subtract a constant from all ranges of the board, as `Scan.corrected` does before it is detected.
+        """Subtract a constant from all ranges of the board, like `Scan.corrected` before detection.
 
         Args:
             range_offset_m: positive where ranges are too long.
@@ -228,7 +228,7 @@ class LidarBoard(BoardSurface):
 
     @property
     def has_rings(self) -> bool:
-        """Whether the LiDAR scans in rings; else `points` are means, `edge_points` places on the outline."""
+        """Whether the LiDAR scans in rings; else `points` are means and `edge_points` lie on the outline."""
         return len(self.ring) > 0 and int(self.ring[0]) != NO_RING
 
     def figures(self) -> dict[str, float]:
@@ -238,7 +238,7 @@ class LidarBoard(BoardSurface):
 
 @dataclass(frozen=True, eq=False)
 class PatternBoard(BoardSurface):
-    """The board in an image of the second of two cameras: the points are its corners.
+    """The board in an image of the second of two cameras, with its corners as points.
 
     Attributes:
         image: the detection.
@@ -248,7 +248,7 @@ class PatternBoard(BoardSurface):
 
     @classmethod
     def of(cls, image: ImageBoard, corners: Array) -> "PatternBoard":
-        """Put the corners of a board (N, 3), frame board, where an image has it.
+        """Place the corners of a board (N, 3), frame board, at its pose in an image.
 
         Args:
             image: the detection.
@@ -261,7 +261,7 @@ class PatternBoard(BoardSurface):
 
     @classmethod
     def candidates(cls, image: ImageBoard, corners: Array) -> list["PatternBoard"]:
-        """List the poses that an image leaves open; arguments as of `of`."""
+        """List the poses compatible with an image; arguments as in `of`."""
         poses = [image.T_cam_board]
         if image.T_cam_board_alternative is not None:
             poses.append(image.T_cam_board_alternative)
@@ -273,8 +273,8 @@ class Observation:
     """One board placement seen by two sensors: a camera channel and a LiDAR, or two sensors of one kind.
 
     Attributes:
-        capture: its name.
-        pose: of the board by the first sensor.
+        capture: the capture's name.
+        pose: pose of the board by the first sensor.
         surface: by the second.
         others: further places where the second sensor may see it.
     """
@@ -286,7 +286,7 @@ class Observation:
 
     @classmethod
     def of(cls, capture: str, pose: BoardPose, places: Sequence[BoardSurface]) -> "Observation":
-        """Pair the first sensor's pose with the possible places for the second sensor, best first."""
+        """Pair the first sensor's pose with the second sensor's candidates, best first."""
         return cls(capture, pose, places[0], tuple(places[1:]))
 
     @property
@@ -313,5 +313,5 @@ class Observation:
 
     @property
     def places(self) -> tuple[BoardSurface, ...]:
-        """All places where the second sensor may see the board, best first."""
+        """All candidates of the board in the second sensor's data, best first."""
         return (self.surface, *self.others)

@@ -1,4 +1,4 @@
-"""Poses of all sensors of a rig on one of them, composed from the calibrated pairs."""
+"""Poses of all sensors of a rig relative to the base sensor, composed from the calibrated pairs."""
 
 from collections.abc import Collection, Sequence
 
@@ -8,19 +8,19 @@ from lce_rig.core.calibration import Calibration, RigPoses, SensorPose, Verdict
 from lce_rig.core.geometry import Array, composition_slopes, relative_pose, sigma_sizes
 
 _VERDICTS: tuple[Verdict, ...] = ("pass", "marginal")
-# A pair of two sensors needs no further list of poses.
+# Minimum number of sensors for a list of poses: a pair already has its pose.
 _FEWEST_SENSORS = 3
 
 
 def find_rig_poses(pairs: Sequence[Calibration], lidars: Collection[str]) -> RigPoses | None:
-    """Compose the pose of each sensor on the base sensor, along the fewest pairs.
+    """Compose each sensor's pose relative to the base sensor, along the shortest chain of pairs.
 
     Among equally short chains, the pairs with the better verdict are used. Failed pairs are skipped. Errors
     of successive pairs are treated as independent.
 
     Args:
         pairs: the results of a session.
-        lidars: of the profile; the first one with a result is the base.
+        lidars: LiDARs of the profile; the first one with a result is the base.
 
     Returns:
         The poses, of LiDARs in the order of the profile, then of cameras; None for two sensors.
@@ -58,7 +58,7 @@ def find_rig_poses(pairs: Sequence[Calibration], lidars: Collection[str]) -> Rig
 
 
 def _pose_on(c: Calibration, sensor: str) -> tuple[Array, Array]:
-    """Return the pose (4, 4) of a pair's other sensor in the frame of this one, and its covariance (6, 6)."""
+    """Return the pose (4, 4) of a pair's other sensor in this one's frame, and its covariance (6, 6)."""
     if sensor == c.camera:
         return c.T_cam_lidar, c.cov
     T, J = relative_pose(np.eye(4), c.T_cam_lidar)

@@ -13,7 +13,7 @@ from lce_rig.core.geometry import Array, exp_so3
 
 # Noise of a return's elevation: of the beam's angle, rad, and of its origin in the sensor, m.
 _SIGMA_RAD, _SIGMA_M = np.radians(0.1), 0.01
-# Number of random returns that are used: the estimate takes 5 ms, and its error stays below 1 cm.
+# Number of random returns used: the estimate takes 5 ms, and its error stays below 1 cm.
 _N_POINTS = 2000
 _MIN_RINGS, _MIN_POINTS = 4, 200
 _MIN_DISTANCE_M = 0.05
@@ -22,7 +22,7 @@ _MAX_STEPS, _CONVERGED = 40, 1e-4
 _LONGEST_STEP = np.repeat([0.5, 0.1], [3, 2])
 # Huber's constant, in robust standard deviations.
 _HUBER = 2.5
-# Number of first steps without outliers: about the frame's origin every return may look like one.
+# Number of first steps without outlier weights: about the frame's origin every return may look like one.
 _PLAIN_STEPS = 5
 # Minimum ratio of the elevations' scatter about the frame's origin to that about another apex.
 _MIN_RATIO = 2.0
@@ -103,14 +103,14 @@ def find_apex(points: NDArray[np.float32], ring: NDArray[np.int16]) -> Apex | No
         to_axis = exp_so3(np.array([change[4], -change[3], 0.0])) @ to_axis
     else:
         return None
-    # Scaled by the actual errors: a scan of exact beams determines its apex exactly.
+    # Scaled by the actual errors: a scan with exact beams determines its apex exactly.
     cov = np.linalg.inv(normal) * max(float(np.average((error / sigma) ** 2, weights=soft)), 1e-6)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
     return Apex(apex, sigma_m, rms, float(rms_at_origin or 0.0))
 
 
 def _about_means(values: Array, group: NDArray[np.intp], weight: Array) -> Array:
-    """Subtract from values (N,) or (N, D) the weighted mean of their group (N,)."""
+    """Subtract the weighted mean of each group (N,) from values (N,) or (N, D)."""
     total = np.bincount(group, weight)
     columns = values if values.ndim == 2 else values[:, None]
     means = [np.bincount(group, weight * column) / total for column in columns.T]

@@ -43,7 +43,7 @@ PRODUCTS = {
 
 @dataclass(frozen=True)
 class Product:
-    """A model whose packets are read.
+    """A model with supported packets.
 
     Attributes:
         code: its factory byte.
@@ -68,7 +68,7 @@ READ = tuple(
 
 
 def product_of(model: str) -> Product | None:
-    """Find the product whose packets a model sends; None if they are not supported."""
+    """Find the packet product of a model; None if not supported."""
     sheet = find_data_sheet(model)
     return next((each for each in READ if sheet is not None and each.name == sheet.name), None)
 
@@ -82,7 +82,7 @@ DATA_PACKET = np.dtype(
 
 PPS_STATES = ("absent", "synchronising", "locked", "error")
 PPS_LOCKED = 2
-#: `nmea` is padded with zeros; fields between these are not used here, and not filled by older firmware.
+#: `nmea` is padded with zeros; the fields in between are unused here and not set by older firmware.
 POSITION_PACKET = np.dtype(
     {
         "names": ["us", "pps", "nmea"],

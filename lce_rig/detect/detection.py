@@ -41,7 +41,7 @@ _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Image, ImageBoard, Li
 
 
 def to_arrays(detection: Detection | Image) -> Arrays:
-    """Flatten a detection into named arrays; figures and names travel as one JSON text.
+    """Flatten a detection into named arrays; figures and names are stored as one JSON text.
 
     Args:
         detection: one image board, the LiDAR candidates of a scan, a refusal, or the image of one.
@@ -91,9 +91,9 @@ class Pair:
 
     Attributes:
         camera: a camera; the first of two LiDARs.
-        channel: of the camera; "" for a LiDAR.
+        channel: channel of the camera; "" for a LiDAR.
         lidar: a LiDAR; the second of two cameras.
-        lidar_channel: of the second camera; "" for a LiDAR.
+        lidar_channel: channel of the second camera; "" for a LiDAR.
     """
 
     camera: str
@@ -103,12 +103,12 @@ class Pair:
 
     @classmethod
     def of(cls, calibration: Calibration) -> "Pair":
-        """Return the sensors of a calibration."""
+        """Return the pair of sensors of a calibration."""
         return cls(calibration.camera, calibration.channel, calibration.lidar, calibration.lidar_channel)
 
     @property
     def folder_name(self) -> str:
-        """Name of the folder of this pair's files if there are several pairs."""
+        """Folder name for this pair's files if there are several pairs."""
         return ".".join(filter(None, (self.camera, self.channel, self.lidar, self.lidar_channel)))
 
     def __str__(self) -> str:
@@ -121,7 +121,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Detections:
-    """The detections of every sensor in every capture with a sample of it.
+    """The detections by sensor and capture.
 
     Attributes:
         images: (camera, channel) -> capture -> detection.
@@ -133,7 +133,7 @@ class Detections:
 
     @property
     def pairs(self) -> list[Pair]:
-        """Every camera channel with every LiDAR that share captures, sorted."""
+        """All pairs of camera channel and LiDAR with common captures, sorted."""
         return [
             Pair(camera, channel, lidar)
             for (camera, channel), images in sorted(self.images.items())
@@ -142,7 +142,7 @@ class Detections:
         ]
 
     def lidar_pairs(self, lidars: Iterable[str]) -> list[Pair]:
-        """List every two of the LiDARs named that share captures, in their order."""
+        """List all pairs of the named LiDARs with common captures, in their order."""
         return [
             Pair(first, "", second)
             for first, second in combinations(lidars, 2)
@@ -150,7 +150,7 @@ class Detections:
         ]
 
     def camera_pairs(self) -> list[Pair]:
-        """List every two cameras that share captures, each by the channel that has the most boards."""
+        """List all pairs of cameras with common captures, each on its channel with the most boards."""
         best: dict[str, tuple[str, set[str]]] = {}
         for (camera, channel), images in sorted(self.images.items()):
             found = {name for name, image in images.items() if isinstance(image, ImageBoard)}
@@ -163,7 +163,7 @@ class Detections:
         ]
 
     def peers(self, lidars: Iterable[str], with_lidar: Collection[str] | None = None) -> list[Pair]:
-        """List every two of the LiDARs named, and every two cameras of which one has no LiDAR.
+        """List all pairs of the named LiDARs, and of cameras if one of them has no LiDAR.
 
         Args:
             lidars: names.
@@ -174,7 +174,7 @@ class Detections:
         return [*self.lidar_pairs(lidars), *of_cameras]
 
     def between(self, pair: Pair, board: Board) -> dict[str, tuple[PoseDetection, SurfaceDetection]]:
-        """List what both sensors of a pair saw in each of their captures, sorted.
+        """List the detections of both sensors of a pair in their common captures, sorted.
 
         Args:
             pair: the sensors.
@@ -189,7 +189,7 @@ class Detections:
         }
 
     def candidates(self, pair: Pair, board: Board) -> tuple[list[Observation], dict[str, Refusal]]:
-        """List the captures in which both sensors detect the board; and by capture why the others do not."""
+        """List the captures in which both sensors detect the board, and the reasons for the others."""
         candidates, refused = [], {}
         for name, (pose, surfaces) in self.between(pair, board).items():
             if isinstance(pose, Refusal):
@@ -206,7 +206,7 @@ class Detections:
         return sorted(first.keys() & second.keys())
 
     def _pair(self, pair: Pair) -> tuple[Mapping[str, Detection], Mapping[str, Detection]]:
-        """Return the detections of the first and of the second sensor, by capture."""
+        """Return the detections of both sensors, by capture."""
         first, second = (
             self.images.get((name, channel), {}) if channel else self.lidars.get(name, {})
             for name, channel in ((pair.camera, pair.channel), (pair.lidar, pair.lidar_channel))
@@ -219,12 +219,12 @@ class Detections:
 
 
 def _as_surfaces(found: Detection, board: Board) -> SurfaceDetection:
-    """Put the corners where the poses that fit an image have them; return boards in a scan as they are."""
+    """Place the corners at the poses compatible with the image; boards from a scan are returned unchanged."""
     return PatternBoard.candidates(found, board.corners()) if isinstance(found, ImageBoard) else found
 
 
 def _as_pose(found: Detection) -> PoseDetection:
-    """Return the poses of the two likeliest boards in a scan; those in an image as they are."""
+    """Return the poses of the two likeliest boards in a scan; poses from an image are returned unchanged."""
     if not isinstance(found, list):
         return found
     T, other = found[0].T_lidar_board, found[1].T_lidar_board if len(found) > 1 else None

@@ -55,7 +55,7 @@ class BoardFinder:
 
     Attributes:
         rig: the profile.
-        board: its board.
+        board: the board to find.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -64,7 +64,7 @@ class BoardFinder:
         self._intrinsics = {name: camera.to_intrinsics() for name, camera in rig.cameras.items()}
 
     def image(self, image: Image) -> ImageBoard | Refusal:
-        """Find the board in one image, of a camera or made from events by others.
+        """Find the board in one image from a camera, or reconstructed by another program.
 
         Raises:
             ProfileError: the camera's intrinsics belong to images of another size.
@@ -72,16 +72,16 @@ class BoardFinder:
         return self.search_image(image).usable
 
     def scan(self, scan: Scan) -> list[LidarBoard] | Refusal:
-        """Find the surfaces of the board's size in one scan, likeliest first."""
+        """Find surfaces of the board's size in one scan, likeliest first."""
         return self.search_scan(scan).usable
 
     def search_image(
         self, image: Image, last: ImageBoard | None = None, *, is_thorough: bool = True
     ) -> Search[ImageBoard]:
-        """Find the board in one image, near its last place first.
+        """Find the board in one image, starting near its last position.
 
         Args:
-            image: of a camera of the rig.
+            image: image of a camera of the rig.
             last: the board in the image before.
             is_thorough: see `find_image_board`.
 
@@ -103,10 +103,10 @@ class BoardFinder:
         max_reprojection_px: float | None = None,
         is_thorough: bool = True,
     ) -> ImageBoard | Refusal:
-        """Find the board's corners by any intrinsics; the profile's limits on boards are not applied.
+        """Find the board's corners with any intrinsics, without the profile's limits on boards.
 
         Args:
-            image: of a camera of the rig.
+            image: image of a camera of the rig.
             intrinsics: at the image's size.
             last: the board in the image before.
             max_reprojection_px: replaces the profile's.
@@ -131,7 +131,7 @@ class BoardFinder:
         )
 
     def search_scan(self, scan: Scan) -> Search[list[LidarBoard]]:
-        """Find the surfaces of the board's size in a whole scan; refuse one in another frame."""
+        """Find surfaces of the board's size in a whole scan; refuse scans in another frame."""
         moved = check_origin(scan)
         if moved is not None:
             return Search(moved, moved)
@@ -140,10 +140,10 @@ class BoardFinder:
         return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
 
     def look_in_scan(self, scan: Scan, poses: Sequence[Array]) -> Search[list[LidarBoard]]:
-        """Find surfaces about poses T_lidar_board (4, 4), those of the scan before or predicted ones.
+        """Find surfaces near poses T_lidar_board (4, 4) from the previous scan or predicted.
 
         Args:
-            scan: of a LiDAR of the rig.
+            scan: scan of a LiDAR of the rig.
             poses: at least one; those about which nothing is found are omitted.
         """
         scan = self.rig.corrected(scan)
@@ -175,7 +175,7 @@ class BoardFinder:
 
 
 def check_origin(scan: Scan) -> Refusal | None:
-    """Refuse a scan whose rings meet far from the frame's origin, as one moved to the robot's frame.
+    """Refuse a scan whose rings meet far from the frame's origin: it was transformed to another frame.
 
     Beams are assumed to begin at the origin; otherwise ring ends and ranges are wrong at every distance.
     """
@@ -184,7 +184,7 @@ def check_origin(scan: Scan) -> Refusal | None:
     apex = find_apex(scan.points, scan.ring)
     if apex is None or not apex.is_beyond(MAX_APEX_M):
         return None
-    x_m, y_m, z_m = (np.round(apex.position_m, 2) + 0.0).tolist()  # to 1 cm, so that scans agree
+    x_m, y_m, z_m = (np.round(apex.position_m, 2) + 0.0).tolist()  # rounded to 1 cm, so that scans agree
     return LIDAR_OTHER_ORIGIN.refusal(x_m=x_m, y_m=y_m, z_m=z_m, limit_m=MAX_APEX_M)
 
 

@@ -51,7 +51,7 @@ def source_of(rig: Rig, sensor: str) -> LiveSource:
 
 
 def driver_of(rig: Rig, sensor: str) -> str:
-    """Name the driver that reads a sensor: the profile's, else the one that goes with its model.
+    """Name the driver that reads a sensor: the profile's, else the default of its model.
 
     Raises:
         SourceError: there is none.
@@ -78,7 +78,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
 
 
 def edge_cameras(rig: Rig) -> list[str]:
-    """Name the cameras that stamp a sync board's edges themselves.
+    """Name the cameras that timestamp a sync board's edges themselves.
 
     Raises:
         SourceError: a camera's driver is unknown.

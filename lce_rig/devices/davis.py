@@ -1,4 +1,4 @@
-"""A DAVIS346 by dv-processing 2: events, frames and the edges at its trigger input.
+"""A DAVIS346 read by dv-processing 2: events, frames and edges at its trigger input.
 
 External pulses cannot trigger its frames; the camera stamps their edges with its own clock, so that this
 clock can be fitted to that of the sync board which sends them.
@@ -33,7 +33,7 @@ _RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
 _US_S = 1e6
 _US = timedelta(microseconds=1)
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
-_OTHER_MODEL = "Is it another model? Check driver.device and resolution_px."
+_OTHER_MODEL = "Check driver.device and resolution_px: it may be another model."
 _CHECK = (
     "Check the USB 3 cable, `lsusb | grep 152a`, iniVation's udev rules (else only root may open it), and "
     "that no other program (DV, a ROS driver) holds it."
@@ -43,11 +43,11 @@ Value = bool | int | float | str
 
 
 class OpenedCamera(NamedTuple):
-    """A camera that is ready to read.
+    """An opened camera, ready to read.
 
     Attributes:
         input: dv-processing's object, read by its getNext* methods.
-        device: its model, serial number and firmware.
+        device: model, serial number and firmware of the camera.
         notes: settings that differ from those requested.
         serial: its serial number.
     """
@@ -103,8 +103,8 @@ class DavisSource(LiveSource):
         }
         for name, channel in self._settings.channels.items():
             if not self._has[channel.kind]:
-                what = f"{self._who}: {self._opened.device} has no {channel.kind} for channel {name!r}"
-                raise SourceError(what, "Is it another model? Check driver.device, or delete the channel.")
+                what = f"{self._label}: {self._opened.device} has no {channel.kind} for channel {name!r}"
+                raise SourceError(what, "Check driver.device and the model, or delete the channel.")
 
     def close(self) -> None:
         """Close the camera."""
@@ -116,7 +116,7 @@ class DavisSource(LiveSource):
         """Report the state of the camera."""
         problems, clock = list(self._opened.notes), None
         if self._delays_ns:
-            # Least age of the latest events on arrival.
+            # Minimum age of the latest events on arrival.
             delay_ms = min(self._delays_ns.copy()) * 1e-6
             clock = findings.DAVIS_CLOCK(delay_ms=delay_ms)
             if abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
@@ -151,8 +151,8 @@ class DavisSource(LiveSource):
             # A file has ended when its last stream has, a camera is gone when any is.
             is_running = getattr(self._input, "isRunningAny", self._input.isRunning)
             if not is_running():
-                hint = "Was it unplugged? Check cable and power; then start again."
-                raise SourceError(f"{self._who}: {self._opened.device} is gone", hint)
+                hint = "Check cable and power; then start again."
+                raise SourceError(f"{self._label}: {self._opened.device} is gone", hint)
             time.sleep(_PAUSE_S)
         return samples
 
@@ -182,11 +182,11 @@ class DavisSource(LiveSource):
 
     def _wrong_size(self, what: str) -> SourceError:
         width, height = self._settings.resolution_px
-        return SourceError(f"{self._who} sends {what}; the profile's has {width}x{height} px", _OTHER_MODEL)
+        return SourceError(f"{self._label} sends {what}; the profile's has {width}x{height} px", _OTHER_MODEL)
 
 
 def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
-    """Open the DAVIS that the profile names, or the only one; set it up and let it see trigger edges.
+    """Open the DAVIS named in the profile, or the only one; set it up and enable trigger edges.
 
     Raises:
         SourceError: dv-processing is missing; the camera is absent, busy, or another model.
@@ -230,7 +230,7 @@ def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
 
 
 def _set_up(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Finding]:
-    """Apply the profile's exposure, frame interval and biases, and switch the trigger input on."""
+    """Apply the profile's exposure, frame interval and biases, and enable the trigger input."""
     biases = {f"bias_{name.lower()}": bias for name, bias in camera.Davis346BiasCF.__members__.items()}
     durations = {
         "exposure_us": (camera.setExposureDuration, camera.getExposureDuration),
@@ -266,7 +266,7 @@ def _set_up(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Fin
 
 
 def number_of(sensor: str, name: str, value: Value) -> float:
-    """Take a control as a positive number.
+    """Parse a control as a positive number.
 
     Raises:
         SourceError: it is none.
@@ -278,7 +278,7 @@ def number_of(sensor: str, name: str, value: Value) -> float:
 
 
 def bias_of(sensor: str, name: str, value: Value) -> tuple[int, int]:
-    """Take a control as a bias, coarse (0 to 7) and fine (0 to 255): "4,39".
+    """Parse a control as a bias, coarse (0 to 7) and fine (0 to 255): "4,39".
 
     Raises:
         SourceError: it is none.
@@ -291,7 +291,7 @@ def bias_of(sensor: str, name: str, value: Value) -> tuple[int, int]:
 
 
 def _first_line(error: Exception) -> str:
-    """Take the library's message without its stack trace."""
+    """Return the library's message without its stack trace."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     cause = next((line for line in lines if line.startswith(("RuntimeError:", "IOError:"))), "")
     return cause.partition(": ")[2] or (lines[0] if lines else type(error).__name__)

@@ -11,7 +11,7 @@ from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 
-#: Limit of the data waiting for the disk: beyond it, data are dropped.
+#: Limit of data waiting for the disk, bytes; above it, new data are dropped.
 MOST_WAITING_BYTES = 512 * 2**20
 
 T = TypeVar("T")
@@ -24,7 +24,7 @@ class DiskWriter(Generic[T]):
     writes nothing more.
 
     Attributes:
-        path: of the session or recording.
+        path: path of the session or recording.
         n_written: items written.
         n_dropped: items dropped because the disk was too slow.
         n_waiting: items not written yet.
@@ -41,7 +41,7 @@ class DiskWriter(Generic[T]):
         """Start the thread.
 
         Args:
-            path: of the session or recording, for messages.
+            path: path of the session or recording, for messages.
             write: writes an item; called in the thread.
             finish: called in the thread after the last item.
             most_waiting_bytes: limit of waiting data; items beyond it are dropped.

@@ -61,7 +61,7 @@ class TriggerEdge(NamedTuple):
 
 
 class TimeReply(NamedTuple):
-    """The answer to time request `cookie`: board time when that had come, and when this was sent."""
+    """The reply to time request `cookie`: board time of its arrival, and of this reply."""
 
     cookie: int
     rx_us: int
@@ -69,7 +69,7 @@ class TimeReply(NamedTuple):
 
 
 class BoardStatus(NamedTuple):
-    """State of the board, once per second: flags, and the number of lines that the host has not read."""
+    """State of the board, once per second: flags, and the number of lines not read by the host."""
 
     flags: int
     n_lost: int
@@ -117,7 +117,7 @@ def _number(field: bytes) -> int:
 
 
 def read_line(line: bytes) -> Message | None:
-    """Parse one line, without its end; None for text or another sentence.
+    """Parse one line without its line terminator; None for plain text and sentences of other types.
 
     Raises:
         ValueError: the line is damaged.
@@ -147,7 +147,7 @@ def read_line(line: bytes) -> Message | None:
 
 
 class LineReader:
-    """Bytes of a serial line in, messages out; damaged lines are counted and skipped.
+    """Splits the bytes of a serial line into messages; damaged lines are counted and skipped.
 
     Attributes:
         n_messages, n_damaged: messages and damaged lines so far.
@@ -158,9 +158,9 @@ class LineReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take received bytes, and return the messages that they complete."""
+        """Process received bytes, and return the messages that they complete."""
         *lines, rest = (self._rest + data).split(b"\n")
-        # This part of an unfinished line is enough to detect that it is too long.
+        # The start of an unfinished line suffices to detect that it is too long.
         self._rest = rest[: MAX_LINE + 1]
         messages: list[Message] = []
         for line in lines:
@@ -175,7 +175,7 @@ class LineReader:
         return messages
 
 
-# Longest round trip: a longer one means that the computer's clock was set meanwhile.
+# Longest plausible round trip, ns: above it, the computer's clock was set meanwhile.
 _MAX_ROUND_TRIP_NS = 2 * NS_PER_S
 # Largest step back of the board's time between messages out of order; a larger one is a restart.
 _MOST_BACK_NS = NS_PER_S
@@ -187,14 +187,14 @@ _NO_CLOCK_S = 5.0
 
 
 class Arrival(NamedTuple):
-    """When a message came: by the time of day, which may be set at any moment, and by a clock never set."""
+    """Arrival time of a message: by the time of day, which may be set, and by a monotonic clock."""
 
     host_ns: int
     steady_ns: int
 
 
 class BoardState:
-    """Bytes and messages in, pulses out; clocks, counts and problems in between.
+    """Converts bytes and messages to pulses; keeps clocks, counts and problems.
 
     Attributes:
         reader: reads the lines, and counts damaged ones.
@@ -205,13 +205,13 @@ class BoardState:
         heard_ns: time of the last message, or of opening the port, by the steady clock.
         hello, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
-        round_trip_ns: of the last time request.
+        round_trip_ns: round trip of the last time request.
         host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from
             time requests and pulses per second; without a model until there are enough of them.
     """
 
     def __init__(self, lines: Mapping[int, str]) -> None:
-        """Begin with a board that has not sent a message yet.
+        """Start with a board that has not sent a message yet.
 
         Args:
             lines: name of the camera on each channel; pulses on others are skipped.
@@ -234,23 +234,23 @@ class BoardState:
         self._asked: tuple[int, int] | None = None
 
     def opened(self, steady_ns: int) -> None:
-        """Note that the port was opened: an unplugged board has lost its state."""
+        """Handle an opened port: an unplugged board has lost its state."""
         self.hello = None
         self._opened_ns = self.heard_ns = steady_ns
 
     def asked(self, cookie: int, sent_ns: int) -> None:
-        """Note that a time request was sent at a time of day."""
+        """Store the time of day of a time request."""
         self._asked = (cookie, sent_ns)
 
     def feed(self, data: bytes, arrival: Arrival) -> list[Pulse]:
-        """Take received bytes, and return the pulses that they report."""
+        """Process received bytes, and return the pulses that they report."""
         messages = self.reader.feed(data)
         if messages:
             self.heard_ns = arrival.steady_ns
         return [pulse for message in messages for pulse in self.take(message, arrival)]
 
     def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
-        """Take a message, and return the pulses that it reports."""
+        """Process a message, and return the pulses that it reports."""
         match message:
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
                 if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:
@@ -286,7 +286,7 @@ class BoardState:
 
     @property
     def has_answered(self) -> bool:
-        """Whether no time request is under way."""
+        """Whether no time request is pending."""
         return self._asked is None
 
     def clock_state(self) -> Finding:
@@ -304,7 +304,7 @@ class BoardState:
         return findings.BOARD_CLOCK(**figures)
 
     def problems(self, now_ns: int) -> tuple[Finding, ...]:
-        """List the problems at a moment of the steady clock."""
+        """List the problems at a time of the monotonic clock."""
         silent_s = (now_ns - self.heard_ns) / NS_PER_S
         if silent_s > _STALLED_S:
             return (findings.BOARD_SILENT(silent_s=silent_s),)

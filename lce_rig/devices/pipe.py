@@ -1,4 +1,4 @@
-"""Raw images from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
+"""Raw images from a command's standard output: GStreamer, ffmpeg or any other program."""
 
 import os
 import selectors
@@ -16,9 +16,9 @@ from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.rig import CameraSettings
 
-# Longest silence before a camera is lost, s: commands may take seconds to open one.
+# Longest silence before a camera counts as lost, s: commands may take seconds to open one.
 _SILENCE_S = 10.0
-# Time for a command to end, s, before it is killed.
+# Grace period for a command to end, s, before it is killed.
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
 _TAIL_BYTES = 2000
@@ -27,7 +27,7 @@ _EXAMPLE = "ffmpeg -loglevel error -f v4l2 -i /dev/video0 -pix_fmt bgr24 -f rawv
 
 
 class ImagePipeSource(LiveSource):
-    """A camera read by a command of the profile; see `LiveSource`.
+    """A camera read by a command from the profile; see `LiveSource`.
 
     The command writes images of the profile's size and pixel_format, without anything between them.
     Such a stream carries no timestamps: those given are the arrival of an image's last byte, and the status
@@ -62,7 +62,7 @@ class ImagePipeSource(LiveSource):
         wanted = self._settings.driver.pixel_format or _USUAL_FORMAT
         code = find_format(wanted)
         if code is None or FORMATS[code].is_compressed:
-            what = f"{self._who}: raw images of driver.pixel_format {wanted!r} are not read"
+            what = f"{self._label}: raw images of driver.pixel_format {wanted!r} are not read"
             raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
             raise SourceError(what, f"It can be {raw}, or missing for {_USUAL_FORMAT}.")
         self._decoder, self._rest = PixelDecoder(code, *self._settings.resolution_px), bytearray()
@@ -76,8 +76,8 @@ class ImagePipeSource(LiveSource):
                 start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
             )
         except OSError as error:
-            hint = "Is the program installed? Give its full path."
-            what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
+            hint = "Install the program, or give its full path."
+            what = f"{self._label}: {command[0]} cannot be started: {error.strerror}"
             raise SourceError(what, hint) from None
         self._stack.callback(_end_process, self._process)
         self._selector = self._stack.enter_context(selectors.DefaultSelector())
@@ -101,7 +101,7 @@ class ImagePipeSource(LiveSource):
         return self._process.stdout, self._process.stderr
 
     def read(self) -> list[LiveSample]:
-        """Return the images that came; see `LiveSource`."""
+        """Return the received images; see `LiveSource`."""
         pictures, complaints = self._pipes()
         samples: list[LiveSample] = []
         for key, _ in self._selector.select(READ_WAIT_S):
@@ -141,11 +141,11 @@ class ImagePipeSource(LiveSource):
         hint = f"Run it in a shell: {' '.join(self._settings.driver.command)}"
         if lines:
             hint = f"It said: {' | '.join(line.strip() for line in lines)}"
-        raise SourceError(f"{self._who}: its command {how} after {self._n_images} images", hint)
+        raise SourceError(f"{self._label}: its command {how} after {self._n_images} images", hint)
 
 
 def _end_process(process: "subprocess.Popen[bytes]") -> None:
-    """Stop the command and all it has started, by force if need be."""
+    """Stop the command and its child processes, by force if necessary."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

@@ -19,7 +19,7 @@ class PixelFormat(NamedTuple):
 
     Attributes:
         n_channels: values per pixel in a row; 0 for JPEG files.
-        bits: of a value; above 8 it takes two bytes, low byte first.
+        bits: bits of a value; above 8 it takes two bytes, low byte first.
         conversion: name of OpenCV's conversion to BGR; "" if not needed.
     """
 
@@ -65,7 +65,7 @@ FORMATS = {
 
 
 def find_format(name: str) -> str | None:
-    """Find the code of a pixel format; None if it is not read here."""
+    """Find the code of a pixel format; None if not supported."""
     code = name.strip().upper().ljust(4)
     return code if code in FORMATS else None
 

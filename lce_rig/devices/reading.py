@@ -1,4 +1,4 @@
-"""Reading attached sensors: a thread each, one queue, counts of samples and losses."""
+"""Read attached sensors: one thread per sensor, one queue, counts of samples and losses."""
 
 import threading
 import time
@@ -17,7 +17,7 @@ from lce_rig.io.findings import LIDAR_UTC
 
 # Window of the displayed rate, s: 15 scans at 5 Hz; a longer one shows changes later.
 _RATE_WINDOW_S = 3.0
-# Two seconds of images, six of scans: longer than a busy computer lets them wait.
+# Capacity of the queue: two seconds of images, six of scans, longer than the delays of a busy computer.
 _N_SLOTS = 64
 READ_WAIT_S = 0.25
 """Longest wait of a driver for data: a source's thread ends no later."""
@@ -31,7 +31,7 @@ class SourceStatus:
     """State of an attached sensor.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         n_samples: samples handed on since it was opened.
         n_dropped: samples dropped because they were not taken in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
@@ -42,7 +42,7 @@ class SourceStatus:
         serial: its serial number; "" if it has not reported one.
         rates_hz: rates measured by a device of several streams, or with a rotor: "scans", "frames", "events".
         n_packets: data packets received; None for a sensor without packets.
-        n_lost_by_line: of a sync board: pulses lost, by line.
+        n_lost_by_line: lost pulses of a sync board, by line.
     """
 
     sensor: str
@@ -65,7 +65,7 @@ class SourceStatus:
 
 
 class Inbox(Generic[T]):
-    """A queue from reader threads to one taker; of each sender the newest items wait, older ones are dropped.
+    """A queue from reader threads to one consumer; it keeps each sender's newest items and drops older ones.
 
     Attributes:
         n_put, n_dropped: items by sender.
@@ -80,10 +80,10 @@ class Inbox(Generic[T]):
         self._changed = threading.Condition()
 
     def put(self, sender: str, items: Iterable[T], n_slots: int = _N_SLOTS) -> None:
-        """Hand items over; never blocks.
+        """Queue items; never blocks.
 
         Args:
-            sender: of the items.
+            sender: sender of the items.
             items: in order.
             n_slots: most items of this sender that may wait; beyond, the oldest is dropped.
         """
@@ -100,13 +100,13 @@ class Inbox(Generic[T]):
             self._changed.notify()
 
     def close(self) -> None:
-        """End the queue: its items can still be taken, without waiting for more."""
+        """Close the queue: its items can still be taken, without waiting for more."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> tuple[str, T] | None:
-        """Take the oldest item with its sender; None if none came in time, or the queue has ended."""
+        """Return the oldest item with its sender; None after the timeout or the queue's end."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
             if not self._items:
@@ -117,7 +117,7 @@ class Inbox(Generic[T]):
 
 
 class RateMeter:
-    """Rate of arrivals over the last seconds; may be read from any thread.
+    """Rate of arrivals over the last seconds; can be read from any thread.
 
     Args:
         now_s: the clock.
@@ -156,28 +156,28 @@ class LiveSource(ABC):
     measures rates and reopens lost devices.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         lost: error and time.monotonic() of the loss; None while the sensor is not lost.
         opened_s: time.monotonic() of the first opening; None before.
     """
 
     def __init__(
-        self, sensor: str, who: str, silence_s: float, what_to_check: str = "", n_slots: int = _N_SLOTS
+        self, sensor: str, label: str, silence_s: float, silence_hint: str = "", n_slots: int = _N_SLOTS
     ) -> None:
         """Prepare without opening the device.
 
         Args:
-            sensor: its name in the profile.
-            who: name of the sensor for messages: "camera 'cam'".
-            silence_s: time without a sample that is an error.
-            what_to_check: the hint of that error.
-            n_slots: most samples that may wait; beyond, the oldest is dropped.
+            sensor: the sensor's name in the profile.
+            label: name of the sensor in messages: "camera 'cam'".
+            silence_s: longest time without a sample, s; then the sensor counts as lost.
+            silence_hint: hint of the error for a lost sensor.
+            n_slots: capacity of the queue; when it is full, the oldest sample is dropped.
         """
         self.sensor = sensor
         self.lost: tuple[SourceError, float] | None = None
         self.opened_s: float | None = None
-        self._who = who
-        self._n_slots, self._silence_s, self._what_to_check = n_slots, silence_s, what_to_check
+        self._label = label
+        self._n_slots, self._silence_s, self._silence_hint = n_slots, silence_s, silence_hint
         self._inbox = Inbox[LiveSample]()
         self._stopping = threading.Event()
         self._settled = threading.Event()
@@ -186,7 +186,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Open the device, so that it sends or can be heard on return. After a failure, `close` is called.
+        """Open the device; on return it can be read. After a failure, `close` is called.
 
         Raises:
             SourceError: it is absent, busy or of another model; the hint says what to check.
@@ -194,7 +194,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def read(self) -> Iterable[LiveSample]:
-        """Return the samples that came; waits a moment at most.
+        """Return the received samples; waits briefly at most.
 
         Raises:
             SourceError: the device failed for good.
@@ -206,15 +206,15 @@ class LiveSource(ABC):
 
     @abstractmethod
     def describe(self) -> SourceStatus:
-        """Report the state of the device, open or not; any thread may ask. Taken samples are counted here."""
+        """Report the state of the device, open or not; thread-safe. Taken samples are counted here."""
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Explain a silence of `silence_s` since the device was opened or last sent."""
         what = "fell silent" if has_sent else "sends nothing"
-        return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
+        return SourceError(f"{self._label} {what}: nothing for {self._silence_s:g} s", self._silence_hint)
 
     def start(self, inbox: Inbox[LiveSample], reopen_every_s: float | None) -> None:
-        """Open the device and read it into a queue, in a thread.
+        """Start a thread that opens the device and reads it into a queue.
 
         Args:
             inbox: takes the samples.
@@ -228,7 +228,7 @@ class LiveSource(ABC):
         self._thread.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the device is open, or could not be opened; returns whether that was in time."""
+        """Wait until the device is open, or could not be opened; return False on timeout."""
         return self._settled.wait(timeout_s)
 
     def stop(self) -> None:
@@ -236,7 +236,7 @@ class LiveSource(ABC):
         self._stopping.set()
 
     def join(self, timeout_s: float | None = None) -> bool:
-        """Wait until the device is closed; returns whether that was in time."""
+        """Wait until the device is closed; return False on timeout."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
@@ -251,7 +251,7 @@ class LiveSource(ABC):
         )
 
     def note_heard(self) -> None:
-        """Note that the device is alive, though no sample is complete yet."""
+        """Record that the device is alive, though no sample is complete yet."""
         self._heard_s = time.monotonic()
 
     @property
@@ -260,7 +260,7 @@ class LiveSource(ABC):
         return self._stopping.is_set()
 
     def _run(self, reopen_every_s: float | None) -> None:
-        """Open and read until asked to stop; a lost device is opened again."""
+        """Open and read until asked to stop; a lost device is reopened."""
         while not self.is_stopping:
             try:
                 self.open()
@@ -271,7 +271,7 @@ class LiveSource(ABC):
                 failure = error
             except Exception as error:  # A bug must not look like the end of the stream.
                 failure = SourceError(
-                    f"{self._who}: its reader failed: {error!r}", "This is a bug: report it."
+                    f"{self._label}: its reader failed: {error!r}", "This is a bug: report it."
                 )
                 failure.__cause__ = error
             self.close()
@@ -281,7 +281,7 @@ class LiveSource(ABC):
                 self._stopping.wait(reopen_every_s)
 
     def _read_on(self) -> SourceError | None:
-        """Read until asked to stop, or until the device is silent for too long: then explain that."""
+        """Read until asked to stop, or raise an error once the device has been silent too long."""
         heard_s, has_sent = time.monotonic(), False
         while not self.is_stopping:
             came = list(self.read())
@@ -290,7 +290,7 @@ class LiveSource(ABC):
                 self._inbox.put(self.sensor, came, self._n_slots)
                 self._rate.add(len(came))
                 heard_s, has_sent = now_s, True
-                # Reopened only with the first sample: a program that starts may still find no camera.
+                # Wait for the first sample: a program that starts may still find no camera.
                 self.lost = None
             elif now_s - max(heard_s, self._heard_s) > self._silence_s:
                 return self.explain_silence(has_sent=has_sent)
@@ -298,7 +298,7 @@ class LiveSource(ABC):
 
 
 class AttachedSensors:
-    """The attached sensors of a rig, read side by side into one queue; open while its `with` block lasts.
+    """The attached sensors of a rig, read in parallel into one queue; open while its `with` block lasts.
 
     They are opened at the same time. A sensor that fails is closed and reopened repeatedly; meanwhile the
     others continue.
@@ -308,7 +308,7 @@ class AttachedSensors:
     """
 
     def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float | None = REOPEN_EVERY_S) -> None:
-        """Take the sources; none is opened yet."""
+        """Take the sources without opening them."""
         self.sources = {source.sensor: source for source in sources}
         self._inbox = Inbox[LiveSample]()
         self._reopen_every_s = reopen_every_s
@@ -319,7 +319,7 @@ class AttachedSensors:
             source.start(self._inbox, self._reopen_every_s)
 
     def stop(self, timeout_s: float | None = None) -> list[str]:
-        """Close every sensor; returns those that do not close in time."""
+        """Close every sensor; return those that do not close in time."""
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         for source in self.sources.values():
             source.stop()
@@ -359,11 +359,11 @@ class AttachedSensors:
         self._inbox.close()
 
     def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
-        """Take the next sample, with its sensor; None if none came in time."""
+        """Return the next sample with its sensor; None on timeout."""
         return self._inbox.take(timeout_s)
 
     def lost(self) -> dict[str, tuple[SourceError, float]]:
-        """Name the sensors that are lost now: why, and since when by time.monotonic()."""
+        """Return the currently lost sensors: the reason, and since when by time.monotonic()."""
         lost = {name: source.lost for name, source in self.sources.items()}
         return {name: why for name, why in lost.items() if why is not None}
 

@@ -28,21 +28,21 @@ class Ros2Source(LiveSource):
     Timestamps are those of the headers, which are as good as the publishing driver makes them.
 
     Args:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         settings: its block of the profile.
     """
 
     def __init__(self, sensor: str, settings: CameraSettings | LidarSettings) -> None:
         if isinstance(settings, CameraSettings):
             channel = settings.first_channel("frames") or next(iter(settings.channels))
-            named, who = settings.channels[channel].topic, f"camera {sensor!r}"
+            named, label = settings.channels[channel].topic, f"camera {sensor!r}"
             self._target = Target(sensor, channel)
         else:
-            named, who = settings.topic, f"LiDAR {sensor!r}"
+            named, label = settings.topic, f"LiDAR {sensor!r}"
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
         hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
-        super().__init__(sensor, who, _SILENCE_S, hint)
+        super().__init__(sensor, label, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
         self._waiting: list[tuple[int, bytes]] = []
@@ -59,11 +59,11 @@ class Ros2Source(LiveSource):
         if not self._topic:
             block = "cameras" if self._target.channel is not None else "lidars"
             hint = f"Set topic in {block}.{self.sensor}; `ros2 topic list -t` lists what is published."
-            raise SourceError(f"{self._who}: the profile names no topic", hint)
+            raise SourceError(f"{self._label}: the profile names no topic", hint)
         try:
             import rclpy
         except ImportError:
-            what = f"{self._who}: driver.type ros2 needs rclpy, which cannot be imported"
+            what = f"{self._label}: driver.type ros2 needs rclpy, which cannot be imported"
             hint = (
                 "Source ROS 2 first (source /opt/ros/humble/setup.bash) and use its Python; pip has no rclpy."
             )
@@ -97,7 +97,7 @@ class Ros2Source(LiveSource):
         self._stack.close()
 
     def read(self) -> list[LiveSample]:
-        """Return the samples that came; see `LiveSource`."""
+        """Return the received samples; see `LiveSource`."""
         self._executor.spin_once(timeout_sec=READ_WAIT_S)
         came, self._waiting = self._waiting, []
         samples: list[LiveSample] = []
@@ -120,7 +120,7 @@ class Ros2Source(LiveSource):
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)
 
     def _find_type(self, node: Any) -> str:
-        """Wait until the topic is published, and name its type without ROS 2's "/msg".
+        """Wait until the topic is published, and return its type without ROS 2's "/msg".
 
         Raises:
             SourceError: it is not, or is of another type.
@@ -145,6 +145,6 @@ class Ros2Source(LiveSource):
         if self._topic in types:
             wanted = " or ".join(sorted(self._target.types))
             raise SourceError(
-                f"{self._who}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
+                f"{self._label}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
             )
-        raise SourceError(f"{self._who}: nothing publishes {self._topic}", hint)
+        raise SourceError(f"{self._label}: nothing publishes {self._topic}", hint)

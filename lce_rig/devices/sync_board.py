@@ -19,7 +19,8 @@ from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig.profile import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
-# Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
+# Time to wait for the board, s: opening the port may reset it, and a VLP-16 takes 2.3 s to lock on its pulses
+# again.
 HELLO_S = 6.0
 SILENCE_S = 30.0
 
@@ -60,13 +61,13 @@ class SyncBoard(LiveSource):
         self._port: serial.Serial | None = None
 
     def open(self) -> None:
-        """Open the port, wait for the board's first words, set its lines and start them.
+        """Open the port, wait for the board's first message, configure its lines and start them.
 
         Raises:
             SourceError: the port cannot be opened, or the board is silent or talks otherwise.
         """
-        # DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
-        # them for a moment all the same.
+        # DTR and RTS stay low on opening: many boards wire them to the reset. Some kernels still raise them
+        # briefly.
         port = serial.Serial(baudrate=self._settings.port_baud, timeout=0.02, write_timeout=0.2)
         port.port, port.exclusive = self._settings.device, True
         port.dtr = port.rts = False
@@ -85,17 +86,17 @@ class SyncBoard(LiveSource):
                 device, baud = self._settings.device, self._settings.port_baud
                 if not self._heard:
                     raise SourceError(
-                        f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
+                        f"{self._label} on {device} is silent: nothing for {self._hello_s:g} s",
                         "Check its power and firmware, and that sync.device is its port.",
                     )
                 raise SourceError(
-                    f"{self._who} on {device} does not talk LCE1: {self._heard!r}",
+                    f"{self._label} on {device} does not talk LCE1: {self._heard!r}",
                     f"Check sync.baud (now {baud}), that this is the board's port, and its firmware.",
                 )
         hello = self._state.hello
         if hello is not None and hello.version != lce1.VERSION:
             raise SourceError(
-                f"{self._who} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
+                f"{self._label} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
                 "Flash the firmware of this version of lce-rig.",
             )
 
@@ -106,7 +107,7 @@ class SyncBoard(LiveSource):
                 self._port.close()
 
     def read(self) -> list[Pulse]:
-        """Return the pulses that came, and send the commands that are due.
+        """Return the received pulses, and send the commands that are due.
 
         Their `sensor` is the camera, or "pps"; timestamps are the board's own time.
 
@@ -123,7 +124,7 @@ class SyncBoard(LiveSource):
             pulses = self._state.feed(data, arrival)
             if self._is_set_up and arrival.steady_ns - self._state.heard_ns > SILENCE_S * NS_PER_S:
                 raise SourceError(
-                    f"{self._who} fell silent: nothing for {SILENCE_S:g} s",
+                    f"{self._label} fell silent: nothing for {SILENCE_S:g} s",
                     "Check its cable and power, and press its reset.",
                 )
             has_restarted = self._state.n_restarts != self._n_restarts
@@ -156,12 +157,12 @@ class SyncBoard(LiveSource):
 
     @property
     def utc_clock(self) -> ClockModel | None:
-        """UTC on the board's clock, which is the LiDAR's; None where the board does not know UTC."""
+        """UTC on the board's clock, which is the LiDAR's; None if the board does not know UTC."""
         with self._lock:
             return self._state.utc_tracker.model
 
     def start_triggers(self, rate_hz: float | None = None) -> None:
-        """Start the pulses of the cameras; running numbers continue.
+        """Start the trigger pulses of the cameras; sequence numbers continue.
 
         Args:
             rate_hz: of all lines instead of the profile's: slow pulses allow images to be matched to pulses.
@@ -171,10 +172,10 @@ class SyncBoard(LiveSource):
             self._set_lines()
 
     def _write(self, command: str) -> int:
-        """Send a command's name and fields; gives the time of day in ns when it went out."""
+        """Send a command's name and fields; return the time of day of sending, ns."""
         assert self._port is not None  # it is open
         sent_ns = time.time_ns()
-        # A board that takes no commands gives no answers either, which is reported.
+        # A board that accepts no commands sends no replies either, which is reported.
         with self._reaching_board(), suppress(serial.SerialTimeoutException):
             self._port.write(lce1.write_sentence(command))
         return sent_ns
@@ -187,7 +188,7 @@ class SyncBoard(LiveSource):
             number = getattr(error, "errno", None)
             cause = errno.errorcode.get(number, number) if number else str(error).partition("(")[0].strip()
             raise SourceError(
-                f"{self._who} on {self._settings.device} is gone: {cause}",
+                f"{self._label} on {self._settings.device} is gone: {cause}",
                 "Check its plug and cable and its power; what was captured before is safe. Begin again when "
                 "`ls -l /dev/serial/by-id` shows it.",
             ) from None
@@ -195,7 +196,7 @@ class SyncBoard(LiveSource):
     def _explain(self, error: Exception) -> SourceError:
         """Explain why the port cannot be opened, with an action."""
         number, device = getattr(error, "errno", None), self._settings.device
-        what = f"{self._who}: {device}"
+        what = f"{self._label}: {device}"
         if number == errno.ENOENT:
             ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
             listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
@@ -232,11 +233,11 @@ class SyncBoard(LiveSource):
         if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS:
             self._asked_ns = now_ns
             self._cookie += 1
-            # The answer is read by this same thread: it cannot overtake the note.
+            # The same thread reads the reply, so the reply cannot precede this entry.
             self._state.asked(self._cookie, self._write(f"LCETM?,{self._cookie}"))
 
     def _tell_utc(self, now_ns: int) -> None:
-        """Send UTC at the start of a second, by the computer's time of day, to a board without a receiver."""
+        """At the start of a second, send the computer's UTC to a board without a receiver."""
         with self._lock:
             pps, model = self._state.pps, self._state.host_tracker.model
         if pps is None or pps[0].origin == "G" or model is None or model.n_used < _UTC_MIN_ANSWERS:

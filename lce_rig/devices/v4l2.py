@@ -1,7 +1,7 @@
-"""A camera of the kernel's video interface: images with the kernel's timestamps, counted, in UTC.
+"""A V4L2 camera: images with the kernel's timestamps and sequence numbers, in UTC.
 
-Drivers say CLOCK_MONOTONIC. Jetson's do too, and use a counter that is seconds away from it. So every clock
-is tried on the timestamps: an image is younger than 0.2 s when it arrives, and never of the future.
+Drivers report CLOCK_MONOTONIC. Jetson's drivers also do, but use a counter that differs from it by seconds.
+Therefore every clock is tested on the timestamps: on arrival, an image must be 0 to 0.2 s old.
 
 References:
     https://docs.kernel.org/userspace-api/media/v4l/buffer.html (V4L2_BUF_FLAG_TIMESTAMP_*)
@@ -41,7 +41,7 @@ _SILENT_HINT = (
 
 
 Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
-# Jetson's drivers flag end of frame, but their timestamp is of the first row's arrival (devices' forums).
+# Jetson's drivers set the end-of-frame flag, but their timestamp is the first row's arrival (vendor forums).
 _JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
 _MAX_DELAY_NS = 200_000_000
 # Largest delay once a clock is known: images come late from the queue after a computer stalls.
@@ -61,7 +61,7 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 
 
 def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us: float | None) -> int:
-    """Return the time from a timestamp's moment to the middle of the image's exposure.
+    """Return the time from the timestamped moment to the middle of the image's exposure.
 
     A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
     to H-1, exposure e and line time l (0 for a global shutter), the middle row m = (H-1)/2 is half exposed at
@@ -75,7 +75,7 @@ def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us:
         mark: the moment.
         timing: line time and delay.
         n_rows: H, of the image.
-        exposure_us: of a row; None where unknown, which counts as none.
+        exposure_us: exposure time of a row; None if unknown, which counts as 0.
     """
     half_us, line_us = 0.5 * (exposure_us or 0.0), timing.line_time_us
     rows_us = 0.5 * (n_rows - 1) * line_us
@@ -89,7 +89,7 @@ def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us:
 
 
 def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
-    """Find which moment a timestamp marks: as the profile says, else as a buffer's flags do.
+    """Find the moment that a timestamp marks: from the profile, else from a buffer's flags.
 
     Args:
         settings: the camera's.
@@ -105,7 +105,7 @@ def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
 
 
 def read_clocks() -> dict[str, int]:
-    """Read every candidate clock now, ns; Jetson's counter only where the kernel gives its offset."""
+    """Read every candidate clock now, ns; Jetson's counter only if the kernel reports its offset."""
     readings = {name: time.clock_gettime_ns(number) for name, number in _CLOCK_IDS.items()}
     try:
         offset_ns = int(_TSC_OFFSET.read_text())
@@ -119,7 +119,7 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, 
     """Choose the clock with 0 <= now - stamp <= 0.2 s; None if no clock fits.
 
     Args:
-        stamp_ns: of an image.
+        stamp_ns: timestamp of an image.
         now_ns: readings of the candidates when it arrived.
 
     Returns:
@@ -133,7 +133,7 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, 
 
 
 class StampClock:
-    """Converts a driver's timestamps to UTC, by the clock that they fit.
+    """Converts a driver's timestamps to UTC, using the clock that matches them.
 
     The computer's UTC clock may be stepped during a run, so its offset from the driver's clock is measured
     again for every image.
@@ -277,7 +277,7 @@ class V4l2Source(LiveSource):
         wanted = self._settings.driver.pixel_format
         code = find_format(wanted) if wanted else next((c for c in offered if c in FORMATS), None)
         if code is None or (offered and code not in offered):
-            what = f"does not offer pixel format {wanted}" if wanted else "offers no pixel format read here"
+            what = f"does not offer pixel format {wanted}" if wanted else "offers no supported pixel format"
             listing = ", ".join(c.strip() for c in offered) or "none"
             raise SourceError(
                 f"{where} {what}",
@@ -294,11 +294,11 @@ class V4l2Source(LiveSource):
         return PixelDecoder(code, width, height, stride)
 
     def read(self) -> list[LiveSample]:
-        """Return the image that came; see `LiveSource`."""
+        """Return the received image; see `LiveSource`."""
         try:
             came = self._device.read(READ_WAIT_S)
         except OSError:
-            # The kernel calls it temporary; should it last, the silence ends it.
+            # The kernel calls it temporary; if it persists, the silence timeout ends it.
             self._n_damaged += 1
             time.sleep(READ_WAIT_S)
             return []

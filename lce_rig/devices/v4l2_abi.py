@@ -41,7 +41,7 @@ def _lay_out(name: str, fields: str, base: type = Structure, **kinds: Any) -> An
     """Lay out a structure of the kernel.
 
     Args:
-        name: of the structure.
+        name: name of the structure.
         fields: name, kind and, of an array, number of each, as "driver char 16, version u32".
         base: Structure or Union.
         kinds: structures that are parts of it, by the names of their fields.

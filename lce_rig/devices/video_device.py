@@ -1,4 +1,4 @@
-"""One video device of the kernel: the form of its images, its memory-mapped buffers, and its settings.
+"""A V4L2 device: image format, memory-mapped buffers, and controls.
 
 Settings have the names that v4l2-ctl shows; they are set from the profile, read back, and compared.
 """
@@ -58,7 +58,7 @@ class VideoDevice:
             raise
 
     def ioctl(self, code: int, what: Structure | c_int32) -> None:
-        """Call the kernel, which writes its answer to the structure.
+        """Call the kernel, which writes its reply to the structure.
 
         Raises:
             OSError: from the kernel.
@@ -81,7 +81,7 @@ class VideoDevice:
             self._fd = -1
 
     def formats(self) -> list[str]:
-        """List the pixel formats it offers, in its own order."""
+        """List the pixel formats of the device, in its own order."""
         codes = []
         ask = abi.FormatDescription(type=abi.VIDEO_CAPTURE)
         while self.grants(abi.ENUMERATE_FORMATS, ask):
@@ -115,7 +115,7 @@ class VideoDevice:
         self.grants(abi.SET_PARAMETERS, ask)
 
     def start(self, n_buffers: int) -> None:
-        """Map buffers and start; the device may grant fewer of them.
+        """Map buffers and start; the device may grant fewer.
 
         Raises:
             SourceError: another program streams from it, or the device fails.
@@ -144,7 +144,7 @@ class VideoDevice:
         self.grants(abi.REQUEST_BUFFERS, request)
 
     def read(self, timeout_s: float) -> tuple[bytes, Any] | None:
-        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None if none came in time.
+        """Wait for an image; return its bytes and the kernel's `v4l2_abi.Buffer`, None on timeout.
 
         Raises:
             SourceError: the device is gone.
@@ -192,7 +192,7 @@ class VideoDevice:
         where = f"camera {self._sensor!r}: {self.path}"
         if error.errno in (errno.ENODEV, errno.ENXIO) or not Path(self.path).exists():
             if self._buffers:
-                hint = "Was it unplugged? Check cable and power, `dmesg | tail`; then start again."
+                hint = "Check cable and power, `dmesg | tail`; then start again."
                 return SourceError(f"{where} is gone", hint)
             return SourceError(f"{where} is not there", _attached())
         if error.errno in (errno.EACCES, errno.EPERM):
@@ -210,7 +210,7 @@ def _buffer(index: int) -> abi.Buffer:
 
 
 def video_devices() -> list[str]:
-    """Name the video devices of this computer: "/dev/video0 (vivid)"."""
+    """List the video devices of this computer: "/dev/video0 (vivid)"."""
     devices = []
     for path in sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name)):
         name = Path("/sys/class/video4linux") / path.name / "name"
@@ -219,17 +219,17 @@ def video_devices() -> list[str]:
 
 
 def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
-    """Return the serial number of the USB device behind a video device; "" if the kernel knows none.
+    """Return the serial number of the USB device behind a video device; "" if unknown.
 
     Args:
-        name: of the video device: "video0".
+        name: name of the video device: "video0".
         system: where the kernel lists video devices.
     """
     try:
         device = (system / name / "device").resolve(strict=True)
     except (OSError, RuntimeError):
         return ""
-    # The interface of a USB device lies in the device's folder, whose `serial` is its own.
+    # The USB interface is a subfolder of its device, which holds the `serial`.
     for folder in (device, device.parent):
         if (folder / "idVendor").exists() and (folder / "serial").exists():
             with suppress(OSError, UnicodeDecodeError):
@@ -245,7 +245,7 @@ def _attached() -> str:
 
 
 def list_controls(device: VideoDevice) -> dict[str, Control]:
-    """List the settings that hold one number, by the names that v4l2-ctl shows."""
+    """List the numeric controls, by their names in v4l2-ctl."""
     controls = {}
     ask = abi.ControlQuery(id=abi.NEXT_CONTROL)
     while device.grants(abi.QUERY_CONTROL, ask):
@@ -299,7 +299,7 @@ def read_control(device: VideoDevice, setting: Control) -> int | None:
 
 
 def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float | None:
-    """Read the exposure time of a row, us; None without a setting in a known unit.
+    """Return the exposure time of a row, us; None without a control in a known unit.
 
     V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
     """

@@ -24,7 +24,7 @@ from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
 """Longest silence before a LiDAR is lost: 1,500 packets."""
-# Least duration of packets that the buffer must hold: the longest pause of a fast enough computer.
+# Minimum duration of packets that the buffer must hold, s: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
@@ -37,7 +37,7 @@ _WANTED_BUFFER_BYTES = 4 << 20
 _PACKET_COST_BYTES = 2304
 # Datagrams read before other threads may run: 85 ms of data packets.
 _MOST_AT_ONCE = 64
-# asm-generic/socket.h; Python names neither.
+# Socket options of asm-generic/socket.h that Python does not define.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES = 2048, 256
 _NS_PER_S = 1_000_000_000
@@ -51,7 +51,7 @@ class Vlp16Source(LiveSource):
     port of data packets (2368); `driver.controls` as `read_controls` reads them.
 
     Args:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         settings: its block of the profile.
         silence_s: time without packets after which it counts as lost.
     """
@@ -226,8 +226,8 @@ class UdpPort:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WANTED_BUFFER_BYTES)
             for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
-                # Without the one arrivals are stamped a little later; without the other, drops look like
-                # losses in the network.
+                # Without the first, timestamps are slightly late; without the second, drops look like network
+                # losses.
                 with contextlib.suppress(OSError):
                     self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
             self._socket.bind(("", port))
@@ -247,7 +247,7 @@ class UdpPort:
         return self._socket.fileno()
 
     def receive_many(self) -> list[Datagram]:
-        """Take the datagrams that have come, 64 at most; never waits.
+        """Return the waiting datagrams, at most 64; never waits.
 
         Raises:
             OSError: the network failed.

@@ -1,1 +1,1 @@
-"""Checks of whether a computer and its sensors are ready to collect: one function each, yielding findings."""
+"""Checks whether a computer and its sensors are ready to collect: one function each, yielding findings."""

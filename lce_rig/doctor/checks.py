@@ -1,4 +1,4 @@
-"""Checks of whether this computer, with these sensors, is ready to collect.
+"""Check whether this computer, with these sensors, is ready to collect.
 
 A check yields findings: first its notes, then the faults. A check of the computer takes the examination, all
 others also the name of a sensor. A fault is a warning if collecting works, but less well. It is an error if
@@ -30,7 +30,7 @@ from lce_rig.rig.profile import BOARD, PPS_LINE
 from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 
-# A capture is a few MB; raw images of 1280x720 px at 30 Hz are 55 MB/s.
+# Minimum and scarce free space, MB: a capture is a few MB; raw 1280x720 px images at 30 Hz are 55 MB/s.
 _MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
 _MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
 # struct timex is 26 longs on 64-bit Linux; its fourth is the largest error, us.
@@ -46,7 +46,7 @@ _ROOM, _MAX_UNLIKE = 2, 0.01
 
 
 def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Measure the free space of a folder's disk, and its rate of writing flushed data."""
+    """Measure the free space of a folder's disk, and its write rate for flushed data."""
     folder = exam.folder.absolute()
     folder = next(path for path in (folder, *folder.parents) if path.exists())
     try:
@@ -54,7 +54,7 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
         block = os.urandom(4 << 20)  # disks that compress are not fooled
         n_bytes, start_s = 0, time.monotonic()
         with tempfile.TemporaryFile(dir=folder) as file:
-            # Half a second or 48 MiB at most, each block flushed as a capture's files are.
+            # At most half a second or 48 MiB, each block flushed like a capture's files.
             while n_bytes < 48 << 20 and time.monotonic() - start_s < 0.5:
                 file.write(block)
                 file.flush()
@@ -82,10 +82,10 @@ def check_computer_clock(_exam: Examination, _subject: str = "") -> Iterator[Fin
 
 
 def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Report the device that answers, or the reason of its failure."""
+    """Report the connected device, or the reason of its failure."""
     seen = exam.seen[sensor]
     if seen.failure is not None:
-        what = seen.failure.what  # without the sensor's name, which the line begins with
+        what = seen.failure.what  # without the sensor's name, which starts the line
         for start in (f"{sensor}: ", f"camera {sensor!r}: "):
             what = what.removeprefix(start)
         yield findings.FAILED(what=what, hint=seen.failure.hint)
@@ -136,7 +136,7 @@ def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
     if sensor in rig.lidars:
         return rig.lidars[sensor].rate_hz
     settings = rig.cameras[sensor].driver
-    # Pulses cannot trigger a DAVIS, which keeps an interval of its own.
+    # Pulses cannot trigger a DAVIS, which has its own frame interval.
     if driver == "davis":
         interval_us = settings.controls.get("frame_interval_us", 0)
         return _US_PER_S / interval_us if isinstance(interval_us, int | float) and interval_us > 0 else None
@@ -178,7 +178,7 @@ def check_clock(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def check_pps(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Check whether a LiDAR is locked to pulses and knows UTC, and which clock its scans carry."""
+    """Check whether a LiDAR is locked to pulses and knows UTC, and which clock its timestamps use."""
     status, lidar = exam.seen[sensor].status, exam.rig.lidars[sensor]
     if status is None or status.clock is None:
         return
@@ -194,7 +194,7 @@ def check_pps(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Finding]:
-    """Count the board's pulses by line, and compare their rates with the profile."""
+    """Count the sync board's pulses by line, and compare their rates with the profile."""
     board, sync = exam.seen[BOARD], exam.rig.sync
     if board.status is None or sync is None:
         return
@@ -203,12 +203,12 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
         rate_hz, action = 0.0, "pps" if line == PPS_LINE else ""
         stamps_ns = [pulse.stamp_ns for pulse in board.pulses if pulse.sensor == line]
         if len(stamps_ns) > 1 and stamps_ns[-1] > stamps_ns[0]:
-            # By the board's clock; lost lines count.
+            # By the board's clock; dropped lines count.
             n_lost = board.status.n_lost_by_line.get(line, 0)
             rate_hz = 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
         figures: dict[str, Any] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
         if abs(rate_hz / expected_hz - 1) > _MAX_OFF_PULSES:
-            # The driver says that the pulse per second is missing.
+            # The driver reports the missing pulse per second.
             severity: Severity = "warning" if rate_hz else "note" if line == PPS_LINE else "error"
             yield findings.LINE_OFF(**figures, severity=severity, action=action)
         else:
@@ -258,7 +258,7 @@ def _count(samples: Sequence[Pulse | Image], first_ns: int, last_ns: int) -> int
 
 
 def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Fit the clock of a camera that sees the board's pulses to these pulses."""
+    """Fit the clock of a camera that receives the sync board's pulses to these pulses."""
     board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = exam.driver(sensor) == "davis"
     if not is_davis or seen.status is None or board is None or board.status is None:
@@ -277,7 +277,7 @@ def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Judge whether boards may move while they are captured; absent sensors do not count."""
+    """Judge whether boards may move during captures; absent sensors do not count."""
     rig, verdict = exam.rig, tie(exam).verdict()
     absent = [sensor for sensor, seen in exam.seen.items() if seen.status is None]
     if not verdict.requires_still_boards:
@@ -297,7 +297,7 @@ def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 
 def tie(exam: Examination) -> RigClock:
-    """Convert every possible sensor to the rig's clock, as `collect` does with the same samples."""
+    """Convert all synchronised sensors to the rig's clock, as `collect` does with the same samples."""
     board = exam.seen.get(BOARD)
     has_board = board is not None and board.status is not None
     cameras = [name for name in exam.rig.cameras if exam.driver(name) == "davis"]
@@ -345,7 +345,7 @@ class Check:
     Attributes:
         subject: "computer", a sensor's name in the profile, or "rig" for several sensors together.
         name: the item checked, in a word.
-        findings: of the check; those without a subject get the line's.
+        findings: findings of the check; those without a subject get the line's.
     """
 
     subject: str
@@ -368,7 +368,7 @@ class Check:
 
 
 def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Check]:
-    """Examine the computer and every sensor of a rig.
+    """Check the computer and every sensor of a rig.
 
     An absent or failing sensor is an error, and everything else is still examined. Takes the duration, and
     the time that the sensors take to open.
@@ -376,7 +376,7 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Ch
     Args:
         rig: the profile.
         duration_s: time for which the sensors are watched.
-        folder: of the sessions.
+        folder: folder of the sessions.
 
     Returns:
         A line for each check: of the computer, of each sensor, of the rig.

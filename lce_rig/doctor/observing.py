@@ -1,4 +1,4 @@
-"""Watch all sensors of a rig at the same time for some seconds; an absent one does not stop the others."""
+"""Watch all sensors of a rig in parallel for some seconds; an absent one does not stop the others."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
-# Longest time for sensors to open: a sync board that is reset by it takes some seconds to answer.
+# Longest time for sensors to open, s: a sync board that is reset by opening takes some seconds to reply.
 _OPENING_S = 10.0
 _CLOSING_S = 3.0
 _POLL_S = 0.05
@@ -28,7 +28,7 @@ class ObservedSensor:
     """Observations of one sensor.
 
     Attributes:
-        sensor: its name in the profile.
+        sensor: the sensor's name in the profile.
         status: last status of its driver; None if it did not open, or ended before its first sample.
         failure: the error if it could not be opened, or ended early.
         watched_s: time for which it was open.
@@ -54,7 +54,7 @@ class ObservedSensor:
 
     @property
     def is_utc(self) -> bool:
-        """Whether its timestamps are its own clock's, which is tied to UTC."""
+        """Whether its timestamps are from its own clock, synchronised with UTC."""
         return self.status is not None and self.status.is_utc
 
     def take(self, sample: LiveSample) -> None:
@@ -82,7 +82,7 @@ class Examination:
 
     Attributes:
         rig: the profile.
-        folder: of the sessions.
+        folder: folder of the sessions.
         seen: observations, by the sensor's name.
     """
 
@@ -91,7 +91,7 @@ class Examination:
     seen: Mapping[str, ObservedSensor] = field(default_factory=dict)
 
     def problems(self, sensor: str, *families: str) -> list[Finding]:
-        """Return the problems that a sensor's driver names, of some families of codes."""
+        """Return the problems reported by a sensor's driver, for some families of codes."""
         status = self.seen[sensor].status
         return [] if status is None else [each for each in status.problems if each.family in families]
 
@@ -104,13 +104,13 @@ class Examination:
 
 
 def observe(sources: Sequence[LiveSource], duration_s: float) -> dict[str, ObservedSensor]:
-    """Open every sensor and watch it, for a time that begins when the last one has opened or failed.
+    """Open and watch every sensor; the time starts when the last one has opened or failed.
 
     If all sensors are lost, it returns early.
 
     Args:
-        sources: of the sensors.
-        duration_s: how long to watch.
+        sources: live sources of the sensors.
+        duration_s: time to watch the sensors, s.
 
     Returns:
         The observations by the sensor's name.
@@ -137,7 +137,7 @@ def observe(sources: Sequence[LiveSource], duration_s: float) -> dict[str, Obser
                 each.watched_s, each.ended_ns = time.monotonic() - source.opened_s, time.time_ns()
                 if isinstance(source, SyncBoard):
                     each.host_clock, each.utc_clock = source.host_clock, source.utc_clock
-    finally:  # After Ctrl-C, too: no program that a source has started may outlive this one.
+    finally:  # Also after Ctrl-C: no child process of a source may outlive this one.
         stuck = sensors.stop(_CLOSING_S)
     for name, each in seen.items():
         if each.failure is None and (each.status is None or name in stuck):

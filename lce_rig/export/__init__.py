@@ -53,7 +53,7 @@ class ExportJob:
         calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
         folder: for the files.
-        robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
+        robot: the robot's own tree of frames; None where outputs hang from the profile's `mount` or root.
         session: with the images and scans; None if only results are available.
         findings: content that was left out of the outputs or put into another form, and why; grows.
     """
@@ -72,7 +72,7 @@ class ExportJob:
 
     @property
     def by_camera(self) -> dict[str, Calibration]:
-        """A calibration of each camera, one with a LiDAR if there is any."""
+        """A calibration of each camera, preferably one with a LiDAR."""
         found = {c.camera: c for c in self.of_cameras}
         for c in self.calibrations:
             for name in (c.camera, c.lidar) if c.is_of_cameras else ():
@@ -81,11 +81,11 @@ class ExportJob:
 
     @cached_property
     def trees(self) -> list[RobotTree]:
-        """The trees of frames in which outputs place the sensors."""
+        """Frame trees in which outputs place the sensors."""
         return build_trees(self.calibrations, self.rig, self.robot)
 
     def name_of(self, calibration: Calibration) -> str:
-        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too in a rig of several."""
+        """Build a file name from the camera, and from the LiDAR in a rig with several."""
         both = f"{calibration.camera}_{calibration.lidar}"
         return both if len(self.rig.lidars) > 1 else calibration.camera
 
@@ -99,10 +99,10 @@ class ExportJob:
         return self.rig.lidars[calibration.lidar].topic or f"/{calibration.lidar}/points"
 
     def head(self, content: str, *calibrations: Calibration, of_one_camera: bool = False) -> list[str]:
-        """List the lines at the head of a file: content, program, whether to use it.
+        """Return the header lines of a file: content, program, whether to use it.
 
         Args:
-            content: of the file.
+            content: content of the file.
             calibrations: those in the file.
             of_one_camera: whether the file is for one camera; else the head names cameras that it lacks.
         """
@@ -123,7 +123,7 @@ class ExportJob:
         return lines
 
     def write(self, name: str, lines: Sequence[str]) -> Path:
-        """Write a text file into the folder; it is there whole or not at all.
+        """Write a text file into the folder atomically.
 
         Raises:
             SessionError: a full disk, no permission.
@@ -133,7 +133,7 @@ class ExportJob:
         return path
 
     def write_yaml(self, name: str, head: Sequence[str], document: Mapping[str, Any]) -> Path:
-        """Write a document as YAML into the folder, after `head` as comments, as `write` does."""
+        """Write a document as YAML into the folder, after `head` as comments; see `write`."""
         path = self.folder / name
         write_atomically(path, yaml_text(head, document))
         return path
@@ -175,7 +175,7 @@ def load_exporter(name: str) -> Exporter:
 
 
 def usual_formats(rig: Rig) -> tuple[str, ...]:
-    """List the formats that are written unless others are named: the profile's `exports`, else the usual."""
+    """List the formats written by default: the profile's `exports`, else the standard ones."""
     return tuple(rig.exports) or USUAL
 
 
@@ -190,7 +190,7 @@ def write_exports(
     robot: RobotTree | None = None,
     findings: list[Finding] | None = None,
 ) -> list[Path]:
-    """Write formats into a folder, in one step: those of an earlier run are removed when all are written.
+    """Write formats into a folder in one step; files of an earlier run are removed when all are written.
 
     Args:
         calibrations: one for each camera and LiDAR.
@@ -199,7 +199,7 @@ def write_exports(
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
         is_forced: write failed calibrations too; every file is then marked as failed.
         session: with images and scans, for formats that show them.
-        robot: its own tree of frames, into which the outputs are to fit.
+        robot: the robot's own tree of frames, into which the outputs are to fit.
         findings: gets those about content that is left out or in another form.
 
     Returns:
@@ -276,7 +276,7 @@ _MOST_METADATA_BYTES = 1 << 20
 
 
 def is_export(path: Path) -> bool:
-    """Return whether lce-rig wrote a file, by its first lines, or a bag, by its metadata.
+    """Check whether lce-rig wrote a file, by its first lines, or a bag, by its metadata.
 
     Raises:
         SessionError: it cannot be read.

@@ -1,4 +1,4 @@
-"""extrinsics.yaml: pose and inverse, each with meaning, example point and uncertainty; and references."""
+"""extrinsics.yaml: pose and inverse, with meaning, example point and uncertainty; references."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def _pair(c: Calibration, rig: Rig) -> dict[str, Any]:
         forward = f"takes points from {in_lidar} to {in_camera}: p_cam = R p_lidar + t"
         backward = f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t"
         backward += "; the camera's pose on the LiDAR"
-    # Points are used less this much of their range.
+    # Subtract this from the points' ranges before use.
     at = {"lidar": c.camera, "other_lidar": c.lidar} if c.is_of_lidars else {"lidar": c.lidar}
     offsets_m = {key: rig.lidars[name].range_offset_m for key, name in at.items() if name in rig.lidars}
     subtracted = {f"{name}_range_offset_m": value for name, value in offsets_m.items() if value}

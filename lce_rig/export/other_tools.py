@@ -32,7 +32,7 @@ from lce_rig.export.robot_tree import RobotTree
 from lce_rig.export.writing import quaternion_xyzw, rpy
 from lce_rig.lens.models import MODELS, convert, grid_rays
 
-# A pixel that a model cannot draw counts as this far off.
+# Error assigned to a pixel that a model cannot project, px.
 _UNDRAWN_PX = 100.0
 # Above this the error is visible in matching and colouring.
 _COARSE_PX = 0.5
@@ -65,12 +65,12 @@ def fit_lens(given: Intrinsics, name: str) -> tuple[Intrinsics, float, float]:
 
 
 def lens_for(job: ExportJob, format_name: str, camera: str, model: str) -> tuple[Intrinsics, list[str]]:
-    """Return a camera's model with the coefficients of a format; file and finding note a fit.
+    """Return a camera's model with the coefficients of a format; a refit is noted in file and finding.
 
     Args:
         job: which gets the finding.
         format_name: for it.
-        camera: its name.
+        camera: the camera's name.
         model: that the format has room for, see `fit_lens`.
 
     Returns:
@@ -249,7 +249,7 @@ class _Entry(NamedTuple):
 
     Attributes:
         key: its name in the file.
-        frame: of the LiDAR's points or the camera's body.
+        frame: frame of the LiDAR's points or the camera's body.
         T_key_frame: (4, 4), which Autoware's description of the sensor adds.
     """
 
@@ -311,7 +311,7 @@ def _entries(tree: RobotTree, job: ExportJob) -> list[_Entry]:
 
 
 def _below_kit(tree: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
-    """Find the sensor's frame directly below the kit in the robot's own tree, with the robot's way to it."""
+    """Find the sensor's frame directly below the kit in the robot's tree, and the chain to the sensor."""
     if job.robot is None or frame not in job.robot.frames or KIT not in tree.chain(frame)[1:]:
         return None
     chain = tree.chain(frame)
@@ -321,7 +321,7 @@ def _below_kit(tree: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
     if bodies.intersection(between):
         return None
     key = [frame, *between][-1]
-    # The frames in between are the sensor's own description, which the robot keeps unchanged.
+    # The frames in between belong to the sensor's own description, which stays unchanged.
     return _Entry(key, frame, job.robot.find_pose(key, frame))
 
 
@@ -332,7 +332,7 @@ def _write_poses(
     poses: Mapping[str, Mapping[str, Array]],
     entries: Sequence[_Entry],
 ) -> Path:
-    """Write poses by frame, below the frame that they are in."""
+    """Write poses by frame, under their parent frame."""
     head = job.head(content, *job.calibrations)
     for entry in entries:
         place = "the frame of the profile"

@@ -1,4 +1,4 @@
-"""A robot's own tree of frames, and the changes in it that make calibrations hold.
+"""A robot's frame tree, and the changes to it that realise the calibrations.
 
 The tree comes from the profile's `mount`, from the robot's URDF, or from the static transforms of a
 recording. Without any of them the sensors make a tree of their own. All outputs with frames are made from
@@ -40,7 +40,7 @@ class Joint(NamedTuple):
 
 
 class JointChange(NamedTuple):
-    """A joint that is new, or that has another pose.
+    """A new joint, or one with a changed pose.
 
     Attributes:
         joint: the joint after the change.
@@ -52,12 +52,12 @@ class JointChange(NamedTuple):
 
     @property
     def is_real(self) -> bool:
-        """Whether it is more than rounding."""
+        """Whether the change is more than rounding."""
         return self.before is None or not np.allclose(self.joint.T_parent_child, self.before, atol=1e-9)
 
     @property
     def moved(self) -> tuple[float, float] | None:
-        """The size of the change (deg, m); None for a new joint."""
+        """Size of the change (deg, m); None for a new joint."""
         if self.before is None:
             return None
         return tangent_sizes(difference(self.joint.T_parent_child, self.before))
@@ -91,7 +91,7 @@ class RobotTree:
         *,
         has_one_root: bool = True,
     ) -> "RobotTree":
-        """Build the tree of joints, and check that it is one.
+        """Build the tree of joints, and check its validity.
 
         Args:
             source: for messages.
@@ -126,21 +126,21 @@ class RobotTree:
         return cls(source, frozenset(counts), above)
 
     def chain(self, frame: str) -> list[str]:
-        """List a frame and those above it, up to the root."""
+        """List a frame and its ancestors, up to the root."""
         frames = [frame]
         while frames[-1] in self.above:
             frames.append(self.above[frames[-1]].parent)
         return frames
 
     def fixed_chain(self, frame: str) -> list[str]:
-        """List a frame and those above it that it never moves against."""
+        """List a frame and the ancestors fixed to it."""
         frames = [frame]
         while (joint := self.above.get(frames[-1])) is not None and joint.is_fixed:
             frames.append(joint.parent)
         return frames
 
     def find_pose(self, frame_a: str, frame_b: str) -> Array:
-        """Compute T_a_b (4, 4) between frames that fixed joints connect.
+        """Compute T_a_b (4, 4) between frames connected by fixed joints.
 
         Raises:
             SessionError: nothing connects them, or a joint between them moves.
@@ -152,7 +152,7 @@ class RobotTree:
         return invert(self._from(common, frame_a)) @ self._from(common, frame_b)
 
     def _from(self, ancestor: str, frame: str) -> Array:
-        """Compute the pose of a frame in one above it."""
+        """Compute the pose of a frame in one of its ancestors."""
         T = np.eye(4)
         while frame != ancestor:
             joint = self.above[frame]
@@ -192,7 +192,7 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
 def fit_tree(
     robot: RobotTree | None, calibrations: Sequence[Calibration], rig: Rig
 ) -> tuple[RobotTree, list[JointChange], list[tuple[str, ...]]]:
-    """Change the joints of a robot's tree to the poses of calibrated sensors.
+    """Change the joints of a robot's tree to match the poses of calibrated sensors.
 
     Of the sensors that calibrations connect, the one nearest to the root stays. Each other sensor of the
     robot keeps its parent, and only its joint's pose changes; a sensor that the robot lacks is added below
@@ -201,7 +201,7 @@ def fit_tree(
 
     Args:
         robot: its own tree; None for one of the sensors alone, under the profile's `mount` if it has one.
-        calibrations: of the rig's sensors.
+        calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
 
     Returns:

@@ -1,4 +1,4 @@
-"""ROS 2 bags (mcap) as outputs: static transforms alone, or the session for Foxglove and RViz with them.
+"""ROS 2 bags (mcap): static transforms alone, or with the session's data for Foxglove and RViz.
 
 References:
     https://github.com/ros2/rosbag2 (metadata.yaml, offered_qos_profiles)
@@ -26,12 +26,12 @@ from lce_rig.show.overlays.overlay import draw_projection, range_limits
 _TF_TYPE, _TF_STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
 _INFO_TYPE, _JPEG_TYPE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 92
-# Captures without timestamps lie this far apart.
+# Interval between captures without timestamps, ns.
 _STEP_NS = _NS_PER_S = 10**9
 
 
 class _Topics:
-    """The topics of a bag; each is announced with its first message."""
+    """The topics of a bag, each created with its first message."""
 
     def __init__(self, writer: Any) -> None:
         self._writer = writer
@@ -46,7 +46,7 @@ class _Topics:
 
 
 def export_tf_static_bag(job: ExportJob) -> list[Path]:
-    """Write tf_static/, a ROS 2 bag with one latched message of all transforms, in place of an earlier one.
+    """Write tf_static/, a ROS 2 bag with all transforms in one latched message; replace an earlier one.
 
     It holds the robot's own transforms on the way to the sensors too, as no other program publishes while a
     bag is played. The message is reliable and transient local, as tf2 wants it. metadata.yaml names lce-rig
@@ -150,7 +150,7 @@ def _write_projected(
 
 @contextmanager
 def _bag_writer(folder: Path, content: str, job: ExportJob) -> Iterator[Any]:
-    """Begin a ROS 2 bag (mcap) in place of an earlier one; metadata.yaml names lce-rig as its writer.
+    """Open a ROS 2 bag (mcap), replacing an earlier one; metadata.yaml names lce-rig as its writer.
 
     Raises:
         SessionError: a full disk, no permission.
@@ -173,7 +173,7 @@ def _bag_writer(folder: Path, content: str, job: ExportJob) -> Iterator[Any]:
 
 
 def _write_tf_static(writer: Any, job: ExportJob, stamp_ns: int) -> None:
-    """Write all transforms as one message on /tf_static, reliable and transient local as tf2 wants it."""
+    """Write all transforms as one message on /tf_static, reliable and transient local as tf2 requires."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(sec=0, nsec=0)

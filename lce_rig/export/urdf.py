@@ -1,4 +1,4 @@
-"""URDF: calibrated sensors as links and fixed joints, in a file of their own or in the robot's.
+"""URDF: calibrated sensors as links and fixed joints, in a separate file or in the robot's.
 
 The robot's tree of frames is read from its URDF or from a recording. An edited URDF keeps its comments, its
 order and everything else.
@@ -104,7 +104,7 @@ def read_robot_bag(path: Path) -> RobotTree:
         with reading(path):
             transforms = deserialize(message).transforms
         for stamped in transforms:
-            # tf began names with a slash, tf2 does not.
+            # tf names start with a slash, tf2 names do not.
             frames = stamped.header.frame_id.removeprefix("/"), stamped.child_frame_id.removeprefix("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
             xyz, xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
@@ -159,11 +159,11 @@ def _parse(path: Path, text: bytes) -> RobotTree:
 def write_into_urdf(
     path: Path, calibrations: Sequence[Calibration], rig: Rig, now: datetime
 ) -> tuple[Path | None, list[JointChange]]:
-    """Replace or add the joints of calibrated sensors in a robot's URDF; its earlier text stays beside it.
+    """Replace or add the joints of calibrated sensors in a robot's URDF; a backup of it is kept.
 
     Args:
         path: the robot's URDF; of a link, the file that it leads to is replaced in one step.
-        calibrations: of the rig's sensors.
+        calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
         now: names the backup, path.urdf.2026-11-22T101500.bak.
 
@@ -224,7 +224,7 @@ def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> byt
 
 
 def _find_joints(text: bytes) -> dict[str, tuple[int, int]]:
-    """Find the first and last byte of each joint below the robot, by its name."""
+    """Find the first and last byte of each joint of the robot, by name."""
     parser = expat.ParserCreate()
     depth, begun, places = 0, ("", 0), {}
 

@@ -1,4 +1,4 @@
-"""Write numbers and texts so that they read back exactly, and rotations as formats hold them.
+"""Write numbers and texts so that they read back exactly, and rotations in each format's form.
 
 References:
     K. Shoemake, "Euler angle conversion", Graphics Gems IV, 1994.
@@ -20,7 +20,7 @@ T_BODY_OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
 
 
 def number(value: float) -> str:
-    """Write a float with all its digits, as YAML 1.1, URDF and a shell read it.
+    """Format a float with all its digits, valid in YAML 1.1, URDF and shells.
 
     Raises:
         ResultRefusedError: the value is not finite.
@@ -30,12 +30,12 @@ def number(value: float) -> str:
         raise ResultRefusedError(f"a figure of the result is not finite: {value}")
     text = repr(value)
     mantissa, e, exponent = text.partition("e")
-    # YAML 1.1 takes 1e-05 for a text: the mantissa needs its point.
+    # YAML 1.1 reads 1e-05 as text: the mantissa needs a decimal point.
     return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
 
 
 def yaml_text(head: Iterable[str], document: Mapping[str, Any]) -> str:
-    """Write comments and a document; lists of numbers stand on one line, and read back exactly."""
+    """Format comments and a document as YAML; number lists stay on one line and read back exactly."""
     return "".join(f"# {line}\n" for line in head) + dump_yaml(document, math.inf)
 
 

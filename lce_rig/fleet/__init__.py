@@ -1,1 +1,1 @@
-"""Many sessions of many robots: run them, keep their results, ask questions of the table."""
+"""Many sessions of many robots: calibrate them, keep their results, query the table."""

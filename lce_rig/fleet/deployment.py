@@ -1,4 +1,4 @@
-"""Deploy a result to a target, ask for its state, and restore an earlier release.
+"""Deploy a result to a target, query its state, and restore an earlier release.
 
 `plan` lists changes and objections, `deploy` makes the changes, `standing` asks for the state, `rollback`
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
@@ -61,7 +61,7 @@ from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 
-# Largest movement without a reason, of pairs whose profile states none: defaults of `nominal_extrinsics`.
+# Largest accepted movement of pairs without a tolerance in the profile: defaults of `nominal_extrinsics`.
 _TOLERANCE_DEG, _TOLERANCE_M = 5.0, 0.1
 _OTHER = "Another deployment came first. Run the same command again."
 
@@ -91,8 +91,8 @@ class Plan:
     """The changes of a deployment.
 
     Attributes:
-        record: of the release that would be made.
-        state: of the target now.
+        record: record of the release that would be made.
+        state: state of the target now.
         changed: files that differ from the current release's: "changed", "missing", "added".
         sensors: changes of the extrinsics.
         findings: objections, and notes on sets that could not be compared.
@@ -118,7 +118,7 @@ class Plan:
 
     @property
     def is_in_place(self) -> bool:
-        """Whether the target holds these very files already."""
+        """Whether the target already holds exactly these files."""
         return self.state.current is not None and not self.changed and not self.state.changed
 
 
@@ -130,9 +130,9 @@ class Deployed:
         release: that is current now.
         replaces: the release that was current before; "" for the first.
         is_new: whether something changed; False if these very files were in place already.
-        output: of the command that ran afterwards; None if none ran.
+        output: output of the command that ran afterwards; None if none ran.
         changed_there: files of the earlier release that were not as they were deployed.
-        remarks: as of `Plan`.
+        remarks: as in `Plan`.
     """
 
     release: ReleaseRecord
@@ -144,7 +144,7 @@ class Deployed:
 
 
 def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
-    """Compare a result with the state of a target; nothing is changed there.
+    """Compare a result with the state of a target, without changing it.
 
     Args:
         result: folder with its result.json.
@@ -219,7 +219,7 @@ def deploy(
                 )
             _commit(place, target, record, record.replaces, "deploy")
         except TargetError:
-            # Free the space, and the name; after a lost connection, the next deployment does.
+            # Free the space and the name; if the connection is lost, the next deployment does it.
             with suppress(TargetError):
                 place.must_run(DISCARD, record.name)
             raise
@@ -228,7 +228,7 @@ def deploy(
 
 
 def standing(target: TargetSettings) -> TargetState:
-    """Ask for the state of a target, and whether its current files are as they were deployed.
+    """Query the state of a target, and whether its current files are unchanged since deployment.
 
     Raises:
         TargetError: it cannot be reached or read.
@@ -238,7 +238,7 @@ def standing(target: TargetSettings) -> TargetState:
 
 
 def _standing(place: Place, folder: Path) -> TargetState:
-    """Ask for the state, and copy the current files to a new folder."""
+    """Query the state, and copy the current files to a new folder."""
     state = read_state(place)
     if state.current is None:
         folder.mkdir()
@@ -251,7 +251,7 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
 
     Args:
         target: where.
-        name: of the release; None takes the one that the current release replaced.
+        name: name of the release; None takes the one that the current release replaced.
         reason: written down there.
 
     Raises:
@@ -305,7 +305,7 @@ def _plan(
 
 
 def _diff(name: str, deployed: Path, new: Path) -> list[str]:
-    """Lines in which a text differs; new and removed texts whole, other files not at all."""
+    """List the changed lines of a text; new and removed texts whole, other files not at all."""
     try:
         before, after = (
             path.read_text("utf-8").splitlines() if path.is_file() else []
@@ -322,14 +322,14 @@ def _stage(
     """Write the files of the set: result.json and the exports."""
     saved = read_result(result / RESULT)
     folder.mkdir()
-    # A failed result is one of the objections, which are decided on together.
+    # A failed result is one of the objections, which are judged together.
     write_exports(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     return saved
 
 
 def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
-    """List objections to a deployment, and note missing dates: the older captures are then unknown."""
+    """List objections to a deployment, and note missing dates, with which the older captures are unknown."""
     origin = saved.provenance
     findings = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
@@ -353,7 +353,7 @@ def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord |
 
 
 def _pairs(folder: Path) -> tuple[str, dict[tuple[str, str], Calibration]]:
-    """Read the rig's name and the calibrations of a set; empty if it holds no readable result."""
+    """Read the rig's name and calibrations of an export set; empty without a readable result."""
     with suppress(LceRigError):
         saved = read_result(folder / RESULT)
         return saved.rig, {(pair.camera, pair.lidar): pair for pair in saved.pairs}
@@ -374,7 +374,7 @@ def _change(key: tuple[str, str], new: Calibration | None, old: Calibration | No
 
 
 def _object(change: SensorChange, rig: Rig) -> list[Finding]:
-    """List objections to the change of a sensor: moved beyond the profile's tolerance, a worse verdict."""
+    """List objections to a sensor's change: moved beyond the profile's tolerance, or a worse verdict."""
     findings, subject = list[Finding](), f"{change.camera} and {change.lidar}"
     if change.rotation_deg is not None and change.translation_m is not None:
         nominal = rig.nominal(change.camera, change.lidar)
@@ -411,7 +411,7 @@ def _commit(
     try:
         ran = place.run(COMMIT, release.name, expected, str(target.keep), pending, json.dumps(entry))
     except LostError as lost:
-        # Ask once more after a lost connection whether the last step was taken.
+        # After a lost connection, query whether the last step was done.
         try:
             current = read_state(place).current
         except LceRigError:
@@ -447,7 +447,7 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
         what = f"{release} is in place, but its command has no outcome: {error.what}"
         raise CommandError(what, f"{error.hint}\n{again}".strip()) from error
     output, _, ending = ran.out.rpartition(f"{SAYS}exit ")
-    # A command that was ended by the time limit may still have written behind its exit code.
+    # A command ended by the time limit may still have written after its exit code.
     code = ending.partition("\n")[0].strip()
     if code != "0":
         said = (output + ran.err).strip()

@@ -22,8 +22,8 @@ class Job:
     """One session or recording.
 
     Attributes:
-        source: its path or address, absolute.
-        robot: its name by the manifest; "" if that does not name it.
+        source: the source's path or address, absolute.
+        robot: the robot's name in the manifest; "" without one.
         fallback_robot: its name if the profile does not name it either: the first folder below the root.
         rig: profile that replaces the session's, or that a recording needs; "" for the session's.
     """
@@ -61,7 +61,7 @@ class Entry(BaseModel):
         return self.path.rstrip("/").replace(_ROBOT, "*")
 
     def robot_of(self, path: str) -> str:
-        """Return the robot that the entry names, or read it from a path that matches; "" without either."""
+        """Return the robot named in the entry, or read from a matching path; "" without either."""
         parts = re.split(r"(\{robot\}|\*\*/|\*\*|\*|\?)", self.path.rstrip("/"))
         rules = {_ROBOT: "([^/]+?)", "**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
         match = re.fullmatch("".join(rules.get(part, re.escape(part)) for part in parts), path)
@@ -123,7 +123,7 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
-    """Find the paths that the entries name; the first entry that matches a path counts.
+    """Find the paths that match the entries; the first matching entry counts.
 
     Raises:
         ProfileError: an entry's profile does not exist; its path starts at the manifest's folder.
@@ -145,7 +145,7 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
 
 
 def folder_name(text: str) -> str:
-    """Build a folder's name from any text; different texts give different names."""
+    """Build a folder name from any text; different texts have different names."""
     name = _SAFE.sub("_", text).strip(".")[:80]
     if name == text:
         return name

@@ -1,4 +1,4 @@
-"""A folder where results are deployed to: on this computer, or on another one by OpenSSH's ssh and scp.
+"""A deployment folder, on this computer or on another one by OpenSSH's ssh and scp.
 
 A target is a folder:
 
@@ -43,7 +43,7 @@ _RUN_OUTPUT = 1 << 16
 _SCRIPT_S, _COPY_S = 120.0, 1800.0
 _LARGEST_KB = 4 << 20
 _LOST = 255
-# Questions cannot be answered; a connection without an answer ends.
+# ssh must not prompt, and unresponsive connections end.
 _SSH = {"BatchMode": "yes", "ConnectTimeout": "10", "ServerAliveInterval": "5", "ServerAliveCountMax": "3"}
 _HINTS = {
     LOCKED: "Wait for the other deployment to end.",
@@ -211,11 +211,11 @@ main "$@"
 
 
 class LostError(TargetError):
-    """The connection was lost, or there never was one."""
+    """The connection was lost or never established."""
 
 
 class Ran(NamedTuple):
-    """A program that ended: its exit code, and the last `MAX_OUTPUT` bytes of both outputs."""
+    """An ended program: its exit code, and the last `MAX_OUTPUT` bytes of both outputs."""
 
     code: int
     out: str
@@ -223,7 +223,7 @@ class Ran(NamedTuple):
 
 
 def run_bounded(words: Sequence[str], timeout_s: float, content: bytes = b"") -> Ran:
-    """Run a program in a process group of its own, up to a time limit, and keep the end of its output.
+    """Run a program in its own process group, up to a time limit, and keep the end of its output.
 
     Args:
         words: the program and its arguments; no shell reads them.
@@ -272,10 +272,10 @@ def run_bounded(words: Sequence[str], timeout_s: float, content: bytes = b"") ->
 
 
 class Place:
-    """A target's folder, here or on another computer; nothing is connected between calls.
+    """A target's folder, local or remote; no connection is kept between calls.
 
     Attributes:
-        path: of the folder, there.
+        path: path of the folder, there.
         label: the target in words.
     """
 
@@ -285,16 +285,16 @@ class Place:
         self._options = [word for name, value in options.items() for word in ("-o", f"{name}={value}")]
 
     def command(self, script: str, *arguments: str) -> list[str]:
-        """Return the command that runs a POSIX script there, with the folder's path as its first argument."""
+        """Return the command that runs a POSIX script at the place, with the folder as its first argument."""
         words = ["sh", "-c", script, "sh", self.path, *arguments]
         if self._host is None:
             return words
-        # One word, quoted for any login shell, so that no part of it runs alone.
+        # One word, quoted for any login shell, so that no part of it is executed.
         host = self._host.replace("[", "").replace("]", "")
         return ["ssh", *self._options, "-T", "--", host, shlex.join(words)]
 
     def run(self, script: str, *arguments: str, content: bytes = b"", timeout_s: float = _SCRIPT_S) -> Ran:
-        """Run a script there; its exit code may be any.
+        """Run a script at the place; any exit code is accepted.
 
         Raises:
             LostError: the connection was lost, or there never was one; or the script does not end.
@@ -302,10 +302,10 @@ class Place:
         return self._call(self.command(script, *arguments), timeout_s, content)
 
     def must_run(self, script: str, *arguments: str, content: bytes = b"") -> str:
-        """Run a script there and return its output.
+        """Run a script at the place and return its output; raise if it fails.
 
         Raises:
-            LostError: as of `run`.
+            LostError: as in `run`.
             TargetError: it failed.
         """
         return self.check(self.run(script, *arguments, content=content)).out
@@ -322,7 +322,7 @@ class Place:
         return ran
 
     def put(self, folder: Path, name: str) -> None:
-        """Copy the content of a folder into an existing one there.
+        """Copy the content of a local folder into an existing folder at the place.
 
         Raises:
             TargetError: it cannot be reached or written; part of it may be there.
@@ -334,7 +334,7 @@ class Place:
             self._scp(*files, f"{self._host}:{self.path}/{name}/")
 
     def get(self, name: str, folder: Path) -> list[str]:
-        """Copy a folder of this name there, of plain files, to a new one here.
+        """Copy the folder of this name, with plain files, to a new local folder.
 
         Returns:
             The first of its entries that are not plain files, or too large; then nothing is copied.
@@ -386,6 +386,6 @@ class Place:
 
 
 def _last_line(text: str) -> str:
-    """Return the last line that is not empty; ssh prints warnings before the cause."""
+    """Return the last non-empty line; ssh prints warnings before the cause."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1] if lines else "no message"

@@ -1,4 +1,4 @@
-"""The registry: a folder of each session's result, and the table of them all.
+"""The registry: one folder per session result, and a table of all results.
 
 The table has a row for each camera and LiDAR of a session, or for a session that failed. It is an index: a
 folder of the registry holds result.json, and beside it `ROWS` with the columns that result.json lacks:
@@ -76,9 +76,9 @@ SCHEMA = pa.schema([pa.field(name, kind) for name, kind in _TYPES.items()])
 COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
 
 _WRITE_AGAIN = "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
-# Rows that share minima and maxima, by which a query skips them.
+# Rows per group with minimum and maximum, by which queries skip groups.
 _ROWS_PER_GROUP = 1 << 16
-# Poses and covariances, most of the bytes, do not shrink: the fastest to read wins.
+# Poses and covariances, most of the bytes, do not compress, so the fastest to read wins.
 _COMPRESSION = "lz4"
 
 
@@ -107,7 +107,7 @@ def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mappi
 
 
 def covariances(column: Any) -> Array:
-    """Unpack a column of covariances (21 values a row, none null) into (N, 6, 6)."""
+    """Unpack a column of covariances (21 values per row, none null) into (N, 6, 6)."""
     values = _flat(column).reshape(-1, len(_UPPER[0]))
     cov = np.zeros((len(values), 6, 6))
     cov[:, _UPPER[0], _UPPER[1]] = values
@@ -116,7 +116,7 @@ def covariances(column: Any) -> Array:
 
 
 def poses(column: Any) -> Array:
-    """Unpack a column of poses (16 values a row, none null) into (N, 4, 4)."""
+    """Unpack a column of poses (16 values per row, none null) into (N, 4, 4)."""
     return _flat(column).reshape(-1, 4, 4)
 
 
@@ -136,7 +136,7 @@ def in_order(table: Any) -> Any:
 
 
 def table_bytes(table: Any) -> bytes:
-    """Write a table of `SCHEMA` as Parquet; equal tables give equal bytes."""
+    """Encode a table of `SCHEMA` as Parquet; equal tables give equal bytes."""
     buffer = io.BytesIO()
     repeated = [field.name for field in SCHEMA if pa.types.is_string(field.type)]
     pq.write_table(
@@ -178,18 +178,18 @@ def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None
 
 
 def chosen_rows(table: Any, where: str) -> Any:
-    """Choose rows of a table of `SCHEMA` by a condition in SQL; they keep their order.
+    """Select rows of a table of `SCHEMA` by an SQL condition, in their order.
 
     Raises:
         UsageError: the condition is wrong; the columns are named.
     """
     import duckdb
 
-    # A condition reads the table and nothing else.
+    # Settings that restrict a condition to reading the table.
     settings: dict[str, Any] = {"enable_external_access": False, "python_enable_replacements": False}
     with duckdb.connect(config={"memory_limit": "1GB", "threads": 2, **settings}) as connection:
         try:
-            # `filter` takes one condition and nothing else.
+            # `filter` accepts exactly one condition.
             return connection.from_arrow(table).filter(where).to_arrow_table().cast(SCHEMA)
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
@@ -199,7 +199,7 @@ def chosen_rows(table: Any, where: str) -> Any:
 FORMAT_VERSION = 1
 SUPERSEDED = ".superseded"
 """Folder of earlier results of sources that have a later one; no folder of a robot begins with a dot."""
-# Small files from an object store take their time, not the processor's.
+# Threads: small files in an object store are limited by latency, not by the processor.
 _READERS = 16
 
 
@@ -215,7 +215,7 @@ class Registry:
 
     @contextmanager
     def result(self, folder: str) -> Iterator[Path]:
-        """Yield an empty folder on this computer that becomes a session's result when the block ends.
+        """Yield an empty local folder that becomes a session's result when the block ends.
 
         `ROWS` makes it a result; `write_rows` writes it. On this computer the folder appears in one step; in
         an object store its files are written one by one, `ROWS` last. An earlier result in this folder is
@@ -247,7 +247,7 @@ class Registry:
             ) from error
 
     def _keep(self, folder: str, draft: Path) -> None:
-        """Set an earlier result of a folder aside, unless all its files are in the new one."""
+        """Keep an earlier result of a folder, unless all its files are in the new one."""
         place = self.place / folder
         for name in place.files():
             if name != ROWS and not (
@@ -257,7 +257,7 @@ class Registry:
                 return
 
     def set_aside(self, folder: str) -> None:
-        """Move a result below `SUPERSEDED`, out of the table's sight; numbered, if one is there.
+        """Move a result below `SUPERSEDED`, outside the table; add a number if the name exists.
 
         Raises:
             SessionError: it cannot be written; the result stays.
@@ -274,12 +274,12 @@ class Registry:
             return [f"{robot}/{name}" for robot, names in zip(robots, inner, strict=True) for name in names]
 
     def found(self, robot: str, ending: str) -> str | None:
-        """Find a robot's result by the end of its folder's name, its fingerprint."""
+        """Find a robot's result by the fingerprint at the end of its folder's name."""
         names = [name for name in (self.place / robot).names() if name.endswith(f"-{ending}")]
         return f"{robot}/{names[-1]}" if names else None
 
     def rows(self, folder: str) -> list[Row]:
-        """Read the rows of one result: none without a result, one with a cause if its files are damaged."""
+        """Read the rows of one result: none without a result; one with the cause for damaged files."""
         place = self.place / folder
         robot, _, name = folder.partition("/")
         names = {"robot": robot, "folder": folder}
@@ -331,7 +331,7 @@ class Registry:
         (self.place / TABLE).write(table_bytes(table))
 
     def consolidate(self, fresh: Iterable[Row] = (), *, rebuild: bool = False) -> Any:
-        """Bring the table in line with the folders and write it.
+        """Update the table from the folders and write it.
 
         Rows of folders that are gone are dropped, those of folders that the table lacks are read. Of two
         results of one source the later one stays; the other's folder is moved below `SUPERSEDED`.
@@ -361,7 +361,7 @@ class Registry:
             unknown = as_table(row for rows in read for row in rows)
         table = pa.concat_tables([old, new, unknown])
         table = table.filter(pc.is_in(table["folder"], value_set=pa.array(folders, pa.string())))
-        # Only the last result of each source stays.
+        # Keep only the last result of each source.
         finished = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
         finished = finished.aggregate([("finished", "max")])
         order = [("source", "ascending"), ("finished_max", "ascending"), ("folder", "ascending")]

@@ -1,4 +1,4 @@
-"""Targets by their name, and the releases at them: sets of files, each with a record of their origin."""
+"""Targets by name, and their releases: sets of files, each with a record of its origin."""
 
 import getpass
 import hashlib
@@ -30,7 +30,7 @@ class _TargetsFile(BaseModel):
 
 
 def read_targets(path: Path) -> dict[str, TargetSettings]:
-    """Read the block `targets` of a file; paths of this computer become absolute.
+    """Read the block `targets` of a file; local paths become absolute.
 
     Raises:
         ProfileError: no such file, or an invalid one; every problem with line and key.
@@ -48,7 +48,7 @@ def find_target(name: str, file: Path | None, session: Path, robot: str | None =
     """Find a target in a file.
 
     Args:
-        name: of the target.
+        name: name of the target.
         file: that lists targets; None for deploy.yaml beside the session.
         session: its folder.
         robot: for a target that stands for many.
@@ -74,16 +74,16 @@ class ReleaseRecord(BaseModel):
     """The file .deployed.json of a release.
 
     Attributes:
-        format_version: of this schema.
-        name: of the release: time of deployment, UTC, and the begin of `set_sha256`.
-        time: of deployment, by the clock of the computer that deployed it.
+        format_version: format version of this schema.
+        name: name of the release: time of deployment, UTC, and the begin of `set_sha256`.
+        time: time of deployment, by the clock of the computer that deployed it.
         by: user@computer that deployed it.
         made_by: the program that wrote the files.
         replaces: the release that was current before; "" for the first.
-        reason: of a forced deployment; "" if it was not forced.
+        reason: reason of a forced deployment; "" if it was not forced.
         forced: codes of the objections.
         files: SHA-256 of each file by its path.
-        robot, serials, date, session_sha256: as of the result's provenance.
+        robot, serials, date, session_sha256: as in the result's provenance.
         verdicts: by camera and LiDAR.
     """
 
@@ -106,9 +106,9 @@ class ReleaseRecord(BaseModel):
 
     @classmethod
     def of(cls, saved: ResultFile, files: Mapping[str, str], state: "TargetState") -> "ReleaseRecord":
-        """Describe the next release at a target, of these files with their SHA-256."""
+        """Describe the next release at a target, with the SHA-256 of its files."""
         now = datetime.now(timezone.utc)
-        # In order of time, even if this computer's clock is behind that of an earlier deployment.
+        # Keep releases in order of time, even if this computer's clock is behind an earlier deployment's.
         newest = max((release.name[:16] for release in state.releases), default="")
         compact = f"{now:{_COMPACT}}"
         if compact <= newest:
@@ -134,7 +134,7 @@ class ReleaseRecord(BaseModel):
         return set_sha256(self.files)
 
     def as_json(self) -> dict[str, Any]:
-        """List its content, and the fingerprint of its files, as plain types."""
+        """Return the content, and the fingerprint of its files, as plain types."""
         return self.model_dump() | {"set_sha256": self.set_sha256}
 
     def line(self) -> str:
@@ -169,7 +169,7 @@ class TargetState:
 
 
 def read_state(place: Place) -> TargetState:
-    """Ask for the state of a target; nothing is changed there.
+    """Query the state of a target, without changing it.
 
     Raises:
         TargetError: it cannot be reached, or `current` or `releases` are not those of lce-rig.
@@ -202,7 +202,7 @@ def read_state(place: Place) -> TargetState:
 
 
 def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
-    """Copy a release to a new folder here.
+    """Copy a release to a new local folder.
 
     Returns:
         Its files that are not as they were deployed: "changed", "missing", "added" or "no plain file" by
@@ -216,14 +216,14 @@ def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
 
 
 def user_name() -> str:
-    """Return user@computer; "" if the system has no name for them."""
+    """Return user@computer; "" if the system does not report them."""
     with suppress(OSError, KeyError):
         return f"{getpass.getuser()}@{socket.gethostname()}"
     return ""
 
 
 def content_of(folder: Path) -> dict[str, str]:
-    """Fingerprint the files of a set by their path; the record and mark of a release are not part of it.
+    """Fingerprint the files of a set by path, without the record and mark of a release.
 
     Raises:
         TargetError: a file cannot be read, or is a link.
@@ -243,13 +243,13 @@ def content_of(folder: Path) -> dict[str, str]:
 
 
 def set_sha256(files: Mapping[str, str]) -> str:
-    """Fingerprint a set of files: of the lines that `sha256sum` prints, by name."""
+    """Fingerprint a set of files: hash the lines that `sha256sum` prints, sorted by name."""
     lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(files.items()))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def differences(files: Mapping[str, str], expected: Mapping[str, str]) -> dict[str, str]:
-    """Compare the files of a set with those expected: "changed", "missing" or "added" by path."""
+    """Compare the files of a set with the expected ones: "changed", "missing" or "added" by path."""
     names = sorted(name for name in files.keys() | expected.keys() if files.get(name) != expected.get(name))
     return {
         name: "missing" if name not in files else "added" if name not in expected else "changed"

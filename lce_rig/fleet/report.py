@@ -44,7 +44,7 @@ MOVED_COLUMNS = (
 """Columns of the table that this module requires."""
 # Error of sensors far from the CAD model, whose results are usable; other errors mark them as wrong.
 _FAR = "verdict.far_from_nominal"
-# 0.01 mm and 0.0006 deg, so that a covariance of zeros can be inverted.
+# 0.01 mm and 0.0006 deg squared, so that zero covariances can be inverted.
 _LEAST = 1e-10 * np.eye(6)
 
 
@@ -58,7 +58,7 @@ class History:
         change: (N, 6) tangent from the pose in the row before, m and rad, axes of the camera; NaN if not
             compared.
         chi2: (N,) of it.
-        limit: of `chi2`.
+        limit: limit of `chi2`.
         robots: state of every robot in the registry.
     """
 
@@ -92,7 +92,7 @@ class History:
 
 
 def history_of(table: Any) -> History:
-    """Compare each result in a table with the one before it.
+    """Compare each result in a table with the previous one.
 
     Args:
         table: `pyarrow.Table` with at least `MOVED_COLUMNS`.
@@ -102,7 +102,7 @@ def history_of(table: Any) -> History:
     order = [(name, "ascending") for name in (*_SENSORS, "date", "folder")]
     rows = table.take(pa.array(_usable(table))).sort_by(order)
     n = len(rows)
-    # Whether each value equals the one before it; null equals null.
+    # Whether each value equals the previous one; null equals null.
     same: dict[str, NDArray[np.bool_]] = {}
     for name in MOVED_COLUMNS[:10]:
         codes = pc.fill_null(rows[name].combine_chunks().dictionary_encode().indices, -1).to_numpy()
@@ -111,7 +111,7 @@ def history_of(table: Any) -> History:
     for name in _SERIALS:
         is_known = rows[name].is_valid().to_numpy()
         is_compared[1:] &= same[name][1:] | ~is_known[1:] | ~is_known[:-1]
-    # A copy of a session is not another one.
+    # A copy of a session does not count as another session.
     is_compared &= ~(same["session_sha256"] & rows["session_sha256"].is_valid().to_numpy())
     change, chi2 = np.full((n, 6), np.nan), np.full(n, np.nan)
     k = np.flatnonzero(is_compared)
@@ -154,8 +154,8 @@ class FleetReport:
     """The content of a report.
 
     Attributes:
-        registry: its address.
-        n_rows: of its table.
+        registry: the registry's address.
+        n_rows: number of rows of its table.
         history: results compared in time.
         findings: robots that moved.
         verdicts: (verdict, or status of a session without result), rows and robots, the most rows first.
@@ -206,7 +206,7 @@ class FleetReport:
         write_atomically(path, json.dumps(document, allow_nan=False) + "\n")
 
     def page(self) -> str:
-        """Write the page, which loads nothing."""
+        """Write the page, which loads no external files."""
         history = self.history
         states = [*history.robots.values()]
         dates = pc.min_max(history.rows["date"]).as_py() if len(history.rows) else {"min": "", "max": ""}
@@ -234,7 +234,7 @@ class FleetReport:
 
 
 def _counted(pairs: Iterable[tuple[Any, str]]) -> list[Count]:
-    """Count rows and robots by key, the most rows first."""
+    """Count rows and robots by key, the most frequent first."""
     robots: dict[Any, list[str]] = {}
     for key, robot in pairs:
         robots.setdefault(key, []).append(robot)

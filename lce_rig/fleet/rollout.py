@@ -1,4 +1,4 @@
-"""Deploy the newest results of many robots to them, one after the other, until the first failure.
+"""Deploy the newest results of many robots, one robot after the other, until the first failure.
 
 Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.
@@ -28,11 +28,11 @@ _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
 @dataclass(frozen=True)
 class RobotState:
-    """One robot in a roll-out.
+    """One robot in a rollout.
 
     Attributes:
-        robot: its name.
-        folder: of its newest result in the registry.
+        robot: the robot's name.
+        folder: folder of its newest result in the registry.
         state: "waiting" until it was reached.
         to: the place of its files.
         release: the current release there afterwards; "" if unknown.
@@ -49,17 +49,17 @@ class RobotState:
     detail: str = ""
 
     def ended(self, state: State, cause: "Exception | str" = "") -> "RobotState":
-        """Return the robot after a step."""
+        """Return the robot's state after a step."""
         detail = f"{cause.what} {cause.hint}".strip() if isinstance(cause, LceRigError) else str(cause)
         return replace(self, state=state, detail=detail)
 
 
 @dataclass
 class Rollout:
-    """The outcome of a roll-out.
+    """The outcome of a rollout.
 
     Attributes:
-        target: its name.
+        target: name of the target.
         stopped_by: the robot that failed and stopped it; "" if none did.
         robots: by name.
     """
@@ -80,7 +80,7 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
     An older result is never used instead, as the sensors may have been moved since.
 
     Args:
-        registry: of the results.
+        registry: registry of the results.
         where: condition in SQL on the rows of the table, as of `Registry.read_table`.
     """
     by_robot: dict[str, list[Mapping[str, Any]]] = {}

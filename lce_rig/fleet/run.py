@@ -1,4 +1,4 @@
-"""Run many sessions on a Dask cluster, one task each, and keep the registry's table."""
+"""Run many sessions on a Dask cluster, one task each, and update the registry's table."""
 
 import logging
 import time
@@ -57,11 +57,11 @@ class FleetRun:
 
 @contextmanager
 def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) -> Iterator[Client]:
-    """Connect to a scheduler, or start workers on this computer and end them when the block ends.
+    """Connect to a scheduler, or start local workers and end them when the block ends.
 
     Args:
         workers: processes of one thread each; of a running cluster, its own count.
-        memory_limit_mb: of each, beside that of its sessions.
+        memory_limit_mb: memory limit of each, beside that of its sessions.
         scheduler: address of a running one, tcp://...
 
     Raises:
@@ -87,7 +87,7 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
         # Ctrl-C reaches all processes of a terminal; this one ends the workers.
         "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"],
     }
-    # Workers that end together with their scheduler are not worth a message.
+    # Do not log workers that end together with their scheduler.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with dask.config.set(settings):
         local = LocalCluster(
@@ -105,14 +105,14 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
 def run_fleet(
     jobs: Sequence[Job], settings: Settings, client: Client, *, progress: Progress = silent
 ) -> FleetRun:
-    """Run sessions that the registry has no result of, and bring its table in line.
+    """Run the sessions without a result in the registry, and update its table.
 
     An interrupt, or the loss of workers, loses nothing that was written: run it again to continue.
 
     Args:
         jobs: the sessions.
-        settings: of the run.
-        client: of the Dask cluster.
+        settings: settings of the run.
+        client: client of the Dask cluster.
         progress: called with (done, total) sessions.
 
     Raises:
@@ -141,7 +141,7 @@ def run_fleet(
 
 
 def _rows_of(future: Any, job: Job, settings: Settings) -> list[Row]:
-    """Return a task's rows; of one that no worker survived, a row with the cause."""
+    """Return a task's rows; if all its workers died, a row with the cause."""
     try:
         rows: list[Row] = future.result()
         return rows
@@ -155,7 +155,7 @@ def _rows_of(future: Any, job: Job, settings: Settings) -> list[Row]:
 
 
 def run_job(job: Job, settings: Settings) -> list[Row]:
-    """Run one session in a process of its own, on a worker; return its rows.
+    """Run one session in a separate process on a worker; return its rows.
 
     Raises:
         SessionError: the registry cannot be written.

@@ -19,7 +19,7 @@ _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 @dataclass(frozen=True)
 class Storage:
-    """A folder or file, by a path or by an address that fsspec knows.
+    """A folder or file, given as a path or an fsspec address.
 
     All methods raise SourceError with one line if the place cannot be reached, for any reason that a library
     reports: missing credentials, no network, no permission.
@@ -37,7 +37,7 @@ class Storage:
         return cls(text.rstrip("/") if "://" in text else str(Path(text).resolve()))
 
     def require_folder(self) -> "Storage":
-        """Return it, if a folder of results can be there.
+        """Return this place if it can be a folder of results.
 
         Raises:
             UsageError: it is a file or a device, an archive, or of an unknown kind.
@@ -58,7 +58,7 @@ class Storage:
 
     @property
     def local(self) -> Path | None:
-        """Its path; None if it is elsewhere."""
+        """Local path; None if it is remote."""
         return None if "://" in self.url else Path(self.url)
 
     @property
@@ -68,7 +68,7 @@ class Storage:
 
     @contextmanager
     def reached(self) -> Iterator[tuple[Any, str]]:
-        """Return fsspec's file system for the place, and the path there; see the class."""
+        """Return fsspec's file system, and the path in it; see the class."""
         try:
             yield url_to_fs(self.url)
         except (LceRigError, *_ABSENT):
@@ -82,12 +82,12 @@ class Storage:
             ) from error
 
     def exists(self) -> bool:
-        """Return whether there is such a file or folder."""
+        """Check whether the file or folder exists."""
         with self.reached() as (fs, path):
             return bool(fs.exists(path))
 
     def read(self) -> bytes | None:
-        """Read it as a file; None if there is none."""
+        """Read the file; None if it does not exist."""
         try:
             with self.reached() as (fs, path):
                 if self.local is not None:
@@ -97,7 +97,7 @@ class Storage:
             return None
 
     def write(self, content: bytes) -> None:
-        """Write it as a file, in one step; raises SessionError, too: a full disk, no permission."""
+        """Write the file in one step; raises SessionError, also for a full disk or missing permission."""
         if self.local is not None:
             write_atomically(self.local, content)
             return
@@ -116,13 +116,13 @@ class Storage:
         )
 
     def files(self) -> list[str]:
-        """List the files below it, by their path in it."""
+        """List the files below this folder, by relative path."""
         with self.reached() as (fs, path):
             fs.invalidate_cache()
             return sorted(str(file).removeprefix(path.rstrip("/") + "/") for file in fs.find(path))
 
     def folders_with(self, marker: str) -> list[str]:
-        """List the outermost folders below it that hold a file of this name, by their path in it.
+        """List the outermost folders below this one that hold a file of this name, by relative path.
 
         The folder itself is "". Folders whose names begin with a dot are skipped.
         """
@@ -136,13 +136,13 @@ class Storage:
         return sorted(folders)
 
     def matching(self, pattern: str) -> list[str]:
-        """List files and folders that match a pattern of fsspec, by their path in it."""
+        """List files and folders that match an fsspec pattern, by relative path."""
         with self.reached() as (fs, path):
             prefix = path.rstrip("/") + "/"
             return sorted(str(match).rstrip("/").removeprefix(prefix) for match in fs.glob(prefix + pattern))
 
     def move(self, target: "Storage") -> None:
-        """Move a folder to another place of the same file system; nothing if it is gone."""
+        """Move a folder within the file system; do nothing if it is missing."""
         try:
             with self.reached() as (fs, path):
                 if self.local is not None and target.local is not None:
@@ -157,7 +157,7 @@ class Storage:
             return  # another run was faster
 
     def upload(self, folder: Path, last: str) -> None:
-        """Copy the files of a folder here to one in an object store, one by one, the file `last` last."""
+        """Copy the files of a local folder to one in an object store, one by one, the file `last` last."""
         files = {
             path.relative_to(folder).as_posix(): str(path) for path in folder.rglob("*") if path.is_file()
         }
@@ -170,7 +170,7 @@ class Storage:
             fs.invalidate_cache()
 
     def fetch(self, target: Path, *, without: frozenset[str] = frozenset()) -> None:
-        """Copy it to this computer; on the same disk, files share their data.
+        """Copy it to this computer; copies on the same disk share their data.
 
         Args:
             target: the copy, which must not exist.

@@ -1,4 +1,4 @@
-"""Where results are deployed to: the block `targets` of a deploy.yaml."""
+"""Deployment targets: the block `targets` of a deploy.yaml."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from lce_rig.rig.profile import OutputFormats
 from lce_rig.rig.settings import RobotName, Settings, Text, problem
 
-# Options that make ssh run a program on this computer are not among them.
+# Allowed ssh options: those that run a local program are excluded.
 SshOption = Literal[
     "AddressFamily",
     "CertificateFile",
@@ -29,7 +29,7 @@ SshOption = Literal[
     "User",
     "UserKnownHostsFile",
 ]
-# [user@]host:path, as scp writes it, without characters of shells and options.
+# [user@]host:path, in scp's syntax, without characters of shells and options.
 _HOST = r"(?:[A-Za-z0-9_][A-Za-z0-9_.-]*@)?(?:[A-Za-z0-9][A-Za-z0-9_.-]*|\[[0-9A-Fa-f:.%a-z]+\])"
 _REMOTE = re.compile(rf"({_HOST}):(.*)", re.DOTALL)
 _REMOTE_PATH = re.compile(r"(?:~/)?[A-Za-z0-9_./][A-Za-z0-9_./+@=-]*")
@@ -41,7 +41,7 @@ ROBOT_FIELD = "{robot}"
 
 
 class TargetSettings(Settings):
-    """A place that robot software reads a result from.
+    """A place from which robot software reads a result.
 
     Attributes:
         to: a folder on this computer, or `user@host:path` by OpenSSH; robot software reads `to`/current/.
@@ -82,7 +82,7 @@ class TargetSettings(Settings):
         return self
 
     def for_robot(self, robot: str) -> "TargetSettings":
-        """Return the settings with a robot's name for {robot}; results of other robots are refused there.
+        """Insert a robot's name for {robot}; results of other robots are then refused.
 
         Raises:
             ValueError: no robot can have this name.
@@ -98,12 +98,12 @@ class TargetSettings(Settings):
 
     @property
     def path(self) -> str:
-        """The folder there; relative ones begin at the home of the user there."""
+        """Folder at the target; relative paths start at the user's home there."""
         remote = _REMOTE.fullmatch(self.to)
         return self.to if remote is None else remote[2].removeprefix("~/") or "."
 
     def located(self, folder: Path) -> "TargetSettings":
-        """Make paths on this computer absolute; relative ones start at the file's folder."""
+        """Make local paths absolute; relative ones start at the file's folder."""
         if _REMOTE.fullmatch(self.to.replace(ROBOT_FIELD, "robot")):
             return self
         return self.model_copy(update={"to": str((folder / Path(self.to).expanduser()).absolute())})

@@ -1,4 +1,4 @@
-"""The work on one session: detect, calibrate, draw, write, in a process of its own.
+"""Work on one session: detect, calibrate, draw, write, in a separate process.
 
 A session that hangs, crashes or takes too much memory ends alone, with its cause.
 """
@@ -47,20 +47,20 @@ from lce_rig.session.session import (
     RESULTS,
 )
 
-# Files and folders on which no result depends.
+# Files and folders that do not affect a result.
 _NOT_NEEDED = frozenset({CALIBRATION, RESULTS, INTRINSICS, DEBUG, REJECTED, OVERLAYS, LOCK})
 _HASH_DIGITS = 12
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a run, for all its sessions.
+    """Settings of a run, common to its sessions.
 
     Attributes:
-        registry: its path or address.
-        method: of the estimates.
-        time_limit_s: of a session.
-        memory_limit_mb: of its process.
+        registry: the registry's path or address.
+        method: method of the estimates.
+        time_limit_s: time limit of a session.
+        memory_limit_mb: memory limit of its process.
         retry: whether sessions without a result are run again.
     """
 
@@ -81,11 +81,11 @@ def work_order(arguments: Mapping[str, Any], tell: Callable[[Row], None]) -> lis
 
 
 def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]:
-    """Run one session, unless the registry holds its result already.
+    """Run one session, unless the registry already holds its result.
 
     Args:
         job: the session.
-        settings: of the run.
+        settings: settings of the run.
         tell: receives the row of the session, with the columns known so far, before the work begins.
 
     Returns:
@@ -122,7 +122,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
             kind = next(kind for each, kind in findings.OF_ERRORS.items() if isinstance(error, each))
             cause = error.finding if isinstance(error, NotEnoughDataError) else None
             failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
-            # Files are named by the session's place.
+            # Replace temporary paths by the session's path.
             failed["detail"] = failed["detail"].replace(str(scratch / "session"), job.source)
             return publish(registry, [failed], start_s)
 
@@ -141,7 +141,7 @@ def first_row(job: Job, settings: Settings) -> Row:
 
 
 def _open(job: Job, scratch: Path) -> tuple[Rig, Session | None, Provenance]:
-    """Copy a session or recording to a folder of this computer.
+    """Copy a session or recording to a local folder.
 
     Returns:
         The profile; the session, None for a recording; its origin, of a recording the robot that the profile
@@ -190,7 +190,7 @@ def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
-    """Describe a session, or one pair of its sensors, that has no result."""
+    """Describe a session, or one pair of its sensors, without a result."""
     return row | {"status": status, "cause": cause.code, "detail": cause.text}
 
 
@@ -204,7 +204,7 @@ def _calibrate(
     solved = {(c.camera, c.lidar) for c in result.pairs}
     every = [*detections.pairs, *detections.peers(session.rig.lidars)]
     pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in every)
-    # Shortages stand in the order of the pairs they belong to.
+    # Report shortages in the order of their pairs.
     lacking = [
         without_result(row | {"camera": camera, "lidar": lidar}, "failed", why)
         for (camera, lidar), why in zip([p for p in pairs if p not in solved], result.shortages, strict=False)
@@ -230,7 +230,7 @@ def publish(
 
     Args:
         registry: where.
-        rows: of one folder, as `with_pairs` describes them.
+        rows: rows of one folder, as `with_pairs` describes them.
         start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
         saved: the result of the session; None if it has none.
@@ -266,7 +266,7 @@ _WITHOUT_MEMORY = (
 
 
 class Ended(NamedTuple):
-    """The end of a session's process.
+    """How a session's process ended.
 
     Attributes:
         rows: its return value; None if it ended before.
@@ -282,13 +282,13 @@ class Ended(NamedTuple):
 
 
 def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memory_limit_mb: float) -> Ended:
-    """Run a function in a process of its own and wait for its end.
+    """Run a function in a separate process and wait for its end.
 
     Args:
         call: "module:function"; it gets the arguments, and a function that sends a row early.
         arguments: JSON values.
         time_limit_s: after which the process is ended.
-        memory_limit_mb: of data, beyond which its allocations fail.
+        memory_limit_mb: memory limit of data, beyond which its allocations fail.
     """
     order = {"call": call, "arguments": dict(arguments), "memory_limit_mb": memory_limit_mb}
     try:
@@ -327,7 +327,7 @@ def _sent(output: bytes) -> tuple[Row, list[Row] | None]:
 
 
 def main() -> None:
-    """Run the function that stdin names in this process, which ends with it or with its parent."""
+    """Run the function named on stdin in this process, which ends with it or with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     order, parent = json.load(sys.stdin), os.getppid()
 
@@ -337,7 +337,7 @@ def main() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    # Messages get a descriptor of their own: libraries print to stdout.
+    # Give messages a separate descriptor: libraries print to stdout.
     messages = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     module, _, name = order["call"].partition(":")

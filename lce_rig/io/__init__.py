@@ -26,7 +26,7 @@ _CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
-    """Open the recording at a path: a folder of images and point clouds, a bag, or a file of an event camera.
+    """Open a recording: a folder of images and point clouds, a bag, or an event camera file.
 
     Raises:
         SourceError: the path is missing, or no reader can open it.
@@ -45,7 +45,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
 
 
 def recognise(path: Path) -> str:
-    """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag is one.
+    """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag counts as a bag.
 
     Raises:
         SourceError: nothing is there, or no recording.
@@ -64,10 +64,10 @@ def recognise(path: Path) -> str:
 def open_recordings(
     paths: Iterable[Path], rig: Rig, options: SourceOptions | Sequence[SourceOptions] | None = None
 ) -> list[Recording]:
-    """Open the recordings at several paths; a folder filled by several recorders yields each of their files.
+    """Open the recordings at several paths; for a folder filled by several recorders, each of its files.
 
     Args:
-        paths: of the recordings.
+        paths: paths of the recordings.
         rig: the profile.
         options: one for all recordings, or one per path.
 
@@ -95,7 +95,7 @@ def open_recordings(
 
 
 def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path, SourceOptions]]:
-    """List the recordings in a folder, with the options for each; any other path is one recording.
+    """List the recordings in a folder, with the options of each; any other path is one recording.
 
     Bags come first, because a sensor in several recordings is read from the first. A file named after a LiDAR
     or a camera of the profile belongs to it.
@@ -114,7 +114,7 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
         if not kinds[_PACKETS] or _holds_clouds(path):
             return [(path, options)]  # A folder of images and point clouds; other files in it are ignored.
         folders, images = [], [path]
-    # A bag in several pieces is in one folder, and is read as one.
+    # A bag split into several files is one folder, read as one recording.
     bags = ([path] if kinds[_BAGS] else []) + folders
     is_one_of_many = len(bags) + len(images) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
     options = replace(options, is_part=options.is_part or is_one_of_many)

@@ -1,4 +1,4 @@
-"""The beams that a scan shows, compared with those of the profile's model."""
+"""Compare the beams found in a scan with those of the profile's model."""
 
 import math
 
@@ -19,7 +19,7 @@ _HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
 _MAX_OF_UNIT_DEG = 1.0
 # Largest rms distance of a part of a model's beams from the nearest of them, in spacings between them.
 _MAX_OF_PART = 0.15
-# The same for models that are suggested, deg, and the most of their beams that are not seen, per ring seen.
+# Limits of suggested models: rms deviation, deg, and ratio of their undetected beams to detected rings.
 _MAX_OF_PART_DEG, _MOST_UNSEEN = 0.1, 0.5
 # Sectors per revolution, and minimum number of those with two rings, of rings, and of returns of a ring.
 _N_SECTORS, _MIN_SECTORS, _MIN_RINGS, _MIN_RETURNS = 360, 20, 3, 10
@@ -44,7 +44,7 @@ def measure_elevations(scan: Scan) -> Array:
     distance rho from the axis: z / rho is fitted against 1 / rho for each ring.
 
     Args:
-        scan: of at least a few metres around, in the LiDAR's own frame.
+        scan: scan of at least a few metres around, in the LiDAR's own frame.
 
     Returns:
         (L,) deg, in the order of the rings' numbers.
@@ -70,8 +70,8 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
     """Compare the rings of a scan with the beams of the profile's model.
 
     Args:
-        scan: of one revolution, in the LiDAR's own frame.
-        settings: of the LiDAR.
+        scan: scan of one revolution, in the LiDAR's own frame.
+        settings: settings of the LiDAR.
 
     Returns:
         Beams of another model, with those that fit; rings or points that are missing regularly.
@@ -91,7 +91,7 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
         n_seen, is_skipped = _rings_in_sectors(scan, of_ring)
         if not is_skipped:
             return _compare_steps(scan, settings)
-        # Every ring that there is has returns in every direction: no point is skipped.
+        # Every existing ring has returns in every direction: no point is skipped.
         is_other = bool(names) and n_seen > _FULL_RATIO * len(elevations_deg)
         if not is_other:
             return [RINGS_SKIPPED(scan.sensor, n_seen=n_seen, n_rings=len(beams_deg))]
@@ -145,13 +145,13 @@ def suggest_models(elevations_deg: Array) -> list[str]:
 
 
 def _fits(elevations_deg: Array, sheet: DataSheet) -> bool:
-    """Return whether measured elevations may be those of a model, or of a part of its beams."""
+    """Check whether measured elevations may be those of a model, or of a part of its beams."""
     if len(elevations_deg) >= sheet.n_rings:
         is_whole = len(elevations_deg) == sheet.n_rings
         return is_whole and _distance_deg(elevations_deg, sheet) <= _MAX_OF_UNIT_DEG
     low_deg, high_deg = min(sheet.elevations_deg), max(sheet.elevations_deg)
     reach_deg = max(low_deg - elevations_deg.min(), elevations_deg.max() - high_deg)
-    # Where beams are closer together than those of two units of one model, the distance proves nothing.
+    # If beams are closer together than the tolerance of units, the distance proves nothing.
     spacing_deg = float(np.median(np.diff(np.sort(sheet.elevations_deg))))
     is_dense = spacing_deg < _MAX_OF_UNIT_DEG
     is_near = is_dense or _distance_deg(elevations_deg, sheet) <= _MAX_OF_PART * spacing_deg
@@ -159,7 +159,7 @@ def _fits(elevations_deg: Array, sheet: DataSheet) -> bool:
 
 
 def _distance_deg(elevations_deg: Array, sheet: DataSheet) -> float:
-    """Return the rms deviation from a model's elevations, or of a part of them from the nearest."""
+    """Return the rms deviation from a model's elevations, or of a subset from the nearest ones."""
     beams_deg, measured_deg = np.sort(sheet.elevations_deg), np.sort(elevations_deg)
     if not len(beams_deg):
         return np.inf
@@ -170,7 +170,7 @@ def _distance_deg(elevations_deg: Array, sheet: DataSheet) -> float:
 
 
 def _rings_in_sectors(scan: Scan, of_ring: NDArray[np.intp]) -> tuple[int, bool]:
-    """Return the number of rings in the median sector, and whether rings are missing there between others.
+    """Return the median number of rings per sector, and whether rings in between are missing.
 
     Lasers fire in the order of the rings, or by turns in the lower and the upper half. Of every k-th point, a
     sector then has each k-th ring, or one half of the rings.

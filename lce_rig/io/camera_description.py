@@ -1,4 +1,4 @@
-"""Cameras as drivers and files describe them, as intrinsics of their images.
+"""Convert camera descriptions of drivers and files to intrinsics of their images.
 
 A description belongs to the sensor's full size. Binning and region of interest lead from there to the images,
 and images that were rectified have the projection matrix P and no distortion.
@@ -40,7 +40,7 @@ _COEFFICIENTS = (
 )
 _PROJECTION = ("projectionmatrix", "p")
 _RECTIFICATION = ("rectificationmatrix", "r")
-# Rotation by rectification below which a calibration sees no difference, deg.
+# Rotation by rectification that has no effect on a calibration, deg.
 _TURNED_DEG = 0.005
 _SIZE = ("imagesize", "resolution", "imgsize", "size")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "camwidth"), ("imageheight", "height", "camheight")
@@ -55,7 +55,7 @@ _MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class CameraDescription:
-    """A camera as described.
+    """A camera as described by a driver or file.
 
     Attributes:
         K: (3, 3) px, at the full size.
@@ -67,8 +67,8 @@ class CameraDescription:
         binning: pixels of the sensor per pixel of the images, in x and y.
         roi_px: (x offset, y offset, width, height) that is read out, at the full size; a width and height of
             zero for all of it.
-        name: of the camera, or "".
-        topic: of its images, or "".
+        name: name of the camera, or "".
+        topic: topic of its images, or "".
     """
 
     K: Array
@@ -117,7 +117,7 @@ class CameraDescription:
             lens,
             fx_px=lens.fx_px / across,
             fy_px=lens.fy_px / down,
-            # A binned pixel's centre is that of the pixels it is made of.
+            # A binned pixel's centre is the centre of its original pixels.
             cx_px=(lens.cx_px - x + 0.5) / across - 0.5,
             cy_px=(lens.cy_px - y + 0.5) / down - 0.5,
             width_px=size_px[0],
@@ -151,20 +151,20 @@ class CameraDescription:
             what = f"its roi of {region[0]}x{region[1]} px at {x}, {y}"
             raise ValueError(f"{what} reaches beyond its {full[0]}x{full[1]} px")
         size = region[0] // self.binning[0], region[1] // self.binning[1]
-        # Some drivers state a mode that the images do not have.
+        # Some drivers report a mode that differs from the images.
         if image_px is not None and not _fits(size, image_px) and _fits(full, image_px):
             return (0, 0), (1, 1), full
         return (x, y), self.binning, size
 
 
 def _fits(size_px: Sequence[int], image_px: Sequence[int]) -> bool:
-    """Compare sizes; a readout may end a few lines early, and an odd size be rounded when it is binned."""
+    """Compare sizes; a readout may end a few lines early, and binning may round an odd size."""
     pairs = zip(size_px, image_px, strict=True)
     return all(-1 <= side - image <= max(CUT_FRACTION * side, 1) for side, image in pairs)
 
 
 def _other_size(lens: Intrinsics, image_px: tuple[int, int]) -> str:
-    """Describe intrinsics of another size than the images', with those of images that were scaled."""
+    """State that the intrinsics are for another image size; add scaled ones if the aspect ratio fits."""
     width, height = image_px
     text = f"it belongs to {lens.width_px}x{lens.height_px} px, the images have {width}x{height} px"
     share = width / lens.width_px
@@ -177,7 +177,7 @@ def _other_size(lens: Intrinsics, image_px: tuple[int, int]) -> str:
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether a topic's name is that of rectified images, as /camera/image_rect_color."""
+    """Check whether a topic name denotes rectified images, such as /camera/image_rect_color."""
     return any(word in ("rect", "rectified") for word in re.split(r"[/_]", topic.lower()))
 
 
@@ -197,7 +197,7 @@ def describe_message(info: Any) -> CameraDescription:
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """The cameras that a file describes.
+    """The cameras described in a file.
 
     Attributes:
         path: the file.
@@ -213,11 +213,11 @@ class CameraFile:
         topics: Sequence[str] = (),
         image_px: tuple[int, int] | None = None,
     ) -> tuple[Intrinsics, list[str]]:
-        """Return a camera's intrinsics and notes, as `CameraDescription.intrinsics`.
+        """Return a camera's intrinsics and notes, see `CameraDescription.intrinsics`.
 
         Args:
-            name: of the camera, which chooses among several.
-            topics: of its images, which choose among several, too.
+            name: name of the camera, which chooses among several.
+            topics: topics of its images, which choose among several, too.
             image_px: (width, height) of its images; None if unknown.
 
         Raises:
@@ -249,7 +249,7 @@ def read_cameras(path: Path) -> CameraFile:
     """
     with reading(path, ProfileError, f"Give {FORMS}.", _MAX_BYTES):
         data = path.read_bytes()
-        # A topic that was echoed for long repeats its camera.
+        # A recorded `rostopic echo` repeats its camera.
         for document in _documents(data):
             if found := tuple(_describe(document)):
                 return CameraFile(path, found)
@@ -315,7 +315,7 @@ def _describe(data: Any, name: str = "", depth: int = 0) -> Iterator[CameraDescr
     Args:
         data: as a parser of YAML returns it.
         name: key of the mapping.
-        depth: of the mapping.
+        depth: nesting depth of the mapping.
 
     Raises:
         ValueError: a camera that cannot be used.
@@ -403,13 +403,13 @@ def _number(flat: Mapping[str, Any], keys: Sequence[str]) -> float:
 
 
 def _first_numbers(flat: Mapping[str, Any], keys: Sequence[str]) -> list[float] | None:
-    """Return the numbers under the first of the keys that has any; None without."""
+    """Return the numbers of the first key that has any; None without."""
     lists = (_numbers(flat.get(key)) for key in keys)
     return next((numbers for numbers in lists if numbers is not None), None)
 
 
 def _numbers(value: Any) -> list[float] | None:
-    """List the numbers of a matrix, as OpenCV and ROS write it, or of nested lists; None for others."""
+    """List the numbers of a matrix in OpenCV's or ROS's form, or of nested lists; None for others."""
     value = value.get("data") if isinstance(value, Mapping) else value
     if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
         return None

@@ -1,4 +1,4 @@
-"""Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
+"""Convert a point cloud with any fields to a `Scan`: names, units and conventions."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ MAX_OFFSET_M = 0.015
 INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
 RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
 TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
-# Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
+# Half of the returns in a room or street are well within a LiDAR's range, unless the unit is mm.
 _FARTHEST_MEDIAN = 3.0
 # A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
@@ -62,7 +62,7 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
 
 
 def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
-    """Find the lines and the nearest line of each point (rho, z)."""
+    """Find the lines, and the nearest line to each point (rho, z)."""
     slope = z / rho
     lines = np.zeros((0, 2))
     is_left = rho >= min(3.0, float(np.median(rho)))
@@ -86,7 +86,7 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
 
 
 def _elevation_peaks(elevation: Array) -> Array:
-    """Find elevations in rad that many points share: runs of a histogram above its thin background."""
+    """Find elevations in rad shared by many points: peaks of a histogram above its background."""
     low = elevation.min() - 2 * BIN_RAD
     bins = ((elevation - low) / BIN_RAD).astype(np.intp)
     counts = np.bincount(bins, minlength=int(bins.max()) + 3).astype(np.float64)
@@ -103,8 +103,8 @@ def _elevation_peaks(elevation: Array) -> Array:
 
 
 def _nearest_line(rho: Array, z: Array, lines: Array) -> tuple[NDArray[np.intp], Array]:
-    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines rise."""
-    # An offset moves a point no further than to the neighbour of the line with the nearest slope.
+    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines ascend."""
+    # Limit an offset's shift of a point to the distance between neighbouring lines.
     guess = np.searchsorted((lines[1:, 0] + lines[:-1, 0]) / 2, z / rho)
     nearest, miss = guess, np.abs(z - rho * lines[guess, 0] - lines[guess, 1])
     for shift in (-1, 1):
@@ -126,7 +126,8 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
         count = np.maximum(np.bincount(ring, minlength=n), 1)
         mean_x, mean_y = np.bincount(ring, x, n) / count, np.bincount(ring, y, n) / count
         dx, dy = x - mean_x[ring], y - mean_y[ring]
-        # A prior keeps the offset near zero for a ring that sees a single distance (0.1 mrad against 15 mm).
+        # A prior keeps the offset near zero for a ring with returns at a single distance (0.1 mrad against 15
+        # mm).
         prior = (1e-4 / MAX_OFFSET_M) ** 2 * count
         offset = np.bincount(ring, dx * dy, n) / (np.bincount(ring, dx * dx, n) + prior)
         offset = np.clip(offset, -MAX_OFFSET_M, MAX_OFFSET_M)
@@ -137,7 +138,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
     return lines
 
 
-# NaN and values beyond a type's range are checked at the places that use them.
+# NaN and values beyond a type's range are checked when used.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
@@ -186,7 +187,7 @@ def to_scan(
     is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > 1e-3)
     if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
-    # Returns of the LiDAR's housing and mount are on no ring and are not used.
+    # Returns from the LiDAR's housing and mount are on no ring and are not used.
     is_far = is_kept & (np.hypot(flat_m, z) >= settings.min_range_m)
     if not is_far.any():
         raise SourceError(
@@ -223,7 +224,7 @@ def to_scan(
 
 
 def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
-    """Return which Livox tags (N,) mark a return as noise with high or moderate confidence.
+    """Check which Livox tags (N,) mark a return as noise with high or moderate confidence.
 
     Bits 0-1 judge by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the Mid-360
     and the HAP on they mark returns between near objects: those that bleed over an edge.
@@ -238,7 +239,7 @@ def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:
-    """Return whether a field is one number per point."""
+    """Check whether a field is one number per point."""
     return field.shape == () and field.kind in "biuf"
 
 
@@ -276,7 +277,7 @@ def _ring(
 
 
 def _refuse_other_frame(points: NDArray[np.float32], ring: NDArray[np.int16], where: str) -> None:
-    """Raise SourceError where rings scatter in elevation because they are seen from another frame."""
+    """Raise SourceError if rings scatter in elevation because the points are in another frame."""
     apex = find_apex(points, ring)
     if apex is not None and apex.is_beyond(MAX_APEX_M) and apex.rms_rad < np.radians(_MOST_THICKNESS_DEG):
         x, y, z = np.round(apex.position_m, 2) + 0.0  # no -0.00
@@ -288,7 +289,7 @@ def _refuse_other_frame(points: NDArray[np.float32], ring: NDArray[np.int16], wh
 
 
 def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[str]) -> NDArray[np.int16]:
-    """Number the rings by elevation; without rings, raise a SourceError that includes the cause."""
+    """Number the rings by elevation; without rings, raise a SourceError with the cause."""
     try:
         ring = rings_from_elevation(points)
     except SourceError as error:
@@ -342,8 +343,8 @@ def _times(
         return offset_ns, None
     first_ns, last_ns = round(float(first) * scale), round(float(ticks.max()) * scale)
     if abs(first_ns) > 10**12 or first_ns > 10**9 > abs(first_ns - stamp_ns):
-        # Times since an epoch, or since the LiDAR's start: only the timestamp's own clock counts, for the
-        # cameras' sake.
+        # Times since an epoch, or since the LiDAR's start: only the timestamp's own clock is shared with the
+        # cameras.
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns

@@ -58,7 +58,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
 
 @np.errstate(invalid="ignore")  # of signalling NaN
 def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Bring pixels to 8 bits; deeper ones are stretched by their darkest and brightest percent.
+    """Convert pixels to 8 bits; deeper images are stretched between their darkest and brightest percent.
 
     Twelve-bit sensors leave the upper bits of 16 empty: a plain shift would give black images.
 
@@ -69,7 +69,7 @@ def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
         return np.ascontiguousarray(pixels)
     if pixels.dtype not in (np.uint16, np.float32):
         raise ValueError(f"its pixels are {pixels.dtype}, not 8 or 16 bit")
-    # Every k-th pixel has the same shares, and no copies of a large image are made.
+    # Every k-th pixel has the same quantiles and needs no copy of a large image.
     sample = pixels.ravel()[:: 1 + pixels.size // _MAX_SAMPLED].astype(np.float64)
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -130,7 +130,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
 
 
 def decode_las(data: bytes) -> NDArray[Any]:
-    """Decode the points of a LAS file: coordinates in metres, intensity and dimensions of its own.
+    """Decode the points of a LAS file: coordinates in metres, intensity and extra dimensions.
 
     Returns:
         Structured (N,), by lower-case names.

@@ -4,7 +4,7 @@ from lce_rig.core.findings import Finding, Kind, Losses, note_kind, warning_kind
 
 
 def worded(losses: Losses) -> list[str]:
-    """List the losses, a line each."""
+    """List the losses, one per line."""
     return [finding.sentence for finding in losses.findings()]
 
 

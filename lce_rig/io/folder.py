@@ -1,4 +1,4 @@
-"""A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
+"""A folder of images and point clouds: per board placement one point cloud and one image per camera."""
 
 import hashlib
 import re
@@ -46,7 +46,7 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
 
 
 def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
-    """Read file names as times in ns; None where any is not a time.
+    """Read file names as times in ns; None if any name is not a time.
 
     Seconds have a decimal point; 19 digits are ns since 1970, 16 are us and 13 are ms. Counters are not
     times.
@@ -67,7 +67,7 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
 def pair_names(
     images: Sequence[str], clouds: Sequence[str], tolerance_s: float = 0.05, *, may_count: bool = True
 ) -> tuple[Pairs, str]:
-    """Match images, or another LiDAR's point clouds, and point clouds by their names (without suffix).
+    """Match images, or another LiDAR's point clouds, with point clouds by name (without suffix).
 
     Equal names are used if nine in ten match; else the nearest time, if names are times and nine in ten find
     a partner within the tolerance; else sorted order, if images and point clouds are equal in number; else
@@ -112,7 +112,7 @@ def pair_names(
 
 
 def _nearest_pairs(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float) -> Pairs:
-    """Pair images and point clouds that are each other's nearest in time, within the tolerance."""
+    """Pair images and point clouds that are mutually nearest in time, within the tolerance."""
     by_image, by_cloud = np.argsort(image_ns, kind="stable"), np.argsort(cloud_ns, kind="stable")
     cloud_of = by_cloud[nearest(image_ns, cloud_ns[by_cloud])]
     image_of = by_image[nearest(cloud_ns, image_ns[by_image])]
@@ -161,7 +161,7 @@ def list_files(folder: Path) -> tuple[list[Path], list[Path]]:
 def _list(
     folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
 ) -> list[Path]:
-    """List the files of one kind in the folder named for it, else in the only one that has any.
+    """List the files of one kind in the folder named for it, else in the only folder with such files.
 
     Raises:
         SourceError: there are none, or several folders have some and none is named for them.
@@ -177,7 +177,7 @@ def _list(
         return here
     if len(holding) == 1:
         return next(iter(holding.values()))
-    hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
+    hint = f"Put them into its subfolder {names[0]}/; formats: {', '.join(sorted(suffixes))}."
     if names is CLOUD_FOLDERS:
         hint += " Or give the LiDAR's recording of the same time as well: --from lidar.pcap."
     if holding:
@@ -187,25 +187,25 @@ def _list(
 
 
 def _folders(folder: Path) -> dict[str, Path]:
-    """List the folders in one, by name in lower case."""
+    """List the subfolders of a folder, by name in lower case."""
     return {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_dir() and p.name[0] != "."}
 
 
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     visible = [p for p in folder.iterdir() if p.name[0] != "."]
-    # Links to devices are listed, for their reader to name.
+    # Links to devices are listed too: their reader reports them.
     found = [p for p in visible if p.suffix.lower() in suffixes and not p.is_dir()]
     return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
 
 
 @dataclass(frozen=True)
 class FileOnDisk:
-    """An image or a point cloud that has not been read yet; the timestamp comes from its name.
+    """An image or point cloud not read yet; the timestamp comes from its name.
 
     Attributes:
         label: its name, for messages; with its folder's where several sensors may have the same names.
         sensor, channel: that it belongs to; a LiDAR has no channel.
-        settings: of the LiDAR; None of an image.
+        settings: settings of the LiDAR; None of an image.
     """
 
     path: Path
@@ -226,7 +226,7 @@ class FileOnDisk:
 
 @dataclass(frozen=True)
 class PlacementOnDisk:
-    """Images, then point clouds, of one placement of the board that have not been read yet."""
+    """Files of one placement of the board, not read yet: the images, then the point clouds."""
 
     files: tuple[FileOnDisk, ...]
 
@@ -249,7 +249,7 @@ class PlacementOnDisk:
         return digest.hexdigest()
 
     def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
-        """Decode all files; also return notes on assumptions and skipped points, in words.
+        """Decode all files; also return notes on assumptions and skipped points.
 
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
@@ -331,7 +331,7 @@ def read_pairs(
     """Read pairs: label, images and scans of each; damaged ones are skipped.
 
     Args:
-        pairs: of a `FolderRecording`.
+        pairs: pairs of a `FolderRecording`.
         notes: receives the pairs that were skipped.
         progress: called with (done, total).
 
@@ -353,7 +353,7 @@ def read_pairs(
 
 
 class ImagesRecording:
-    """Images named by time, recorded along with another recording's scans; see `ContinuousRecording`.
+    """Images named by time, recorded with another recording's scans; see `ContinuousRecording`.
 
     Attributes:
         path: the folder.
@@ -364,7 +364,7 @@ class ImagesRecording:
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
-        """Find the images; nothing is decoded yet.
+        """Find the images without decoding them.
 
         Raises:
             SourceError: there are none, their camera is not known, or their names are not timestamps.
@@ -394,7 +394,7 @@ class ImagesRecording:
         self.key = f"{fingerprint(ends)}:{self.n_samples}"
 
     def samples(self) -> Iterator[Image]:
-        """Yield the images, in order of time; those that cannot be read are counted in `notes`.
+        """Yield the images in order of time; unreadable ones are counted in `notes`.
 
         Raises:
             SourceError: not one could be read.
@@ -416,7 +416,7 @@ class ImagesRecording:
 
 
 class FolderRecording:
-    """Images and point clouds in folders side by side, or in one; those of several sensors in a folder each.
+    """Images and point clouds in one folder or in two; with several sensors, one folder per sensor.
 
     Attributes:
         path: the folder.
@@ -425,7 +425,7 @@ class FolderRecording:
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
-        """Find the files and pair them; nothing is decoded yet.
+        """Find the files and pair them without decoding them.
 
         Raises:
             SourceError: no images, no point clouds, no way to pair them, or images whose camera is not known.
@@ -469,7 +469,7 @@ class FolderRecording:
         """Match each camera's images, or other LiDAR's point clouds, with the point clouds."""
         pairings = [self._pair_sensor(files, clouds) for files in others]
         if not all(reason.startswith(IN_ORDER) for _, reason in pairings):
-            # A camera whose names match less well must not be counted off against the others' names.
+            # A camera with worse matching names must not affect the others.
             pairings = [self._pair_sensor(files, clouds, may_count=False) for files in others]
         for files, (pairs, reason) in zip(others, pairings, strict=True):
             whose = f"{files[0].sensor}: " if len(others) > 1 or not files[0].channel else ""

@@ -95,12 +95,12 @@ class PcapFile:
     def choose_sender(
         self, explain: Callable[[Datagram], str], what: str, lidar: str, driver: DriverSettings
     ) -> tuple[str, int]:
-        """Choose the sensor (address, port sent to) by the start of the file: the profile's, or the only one.
+        """Choose the sensor (address, destination port) at the file's start: the profile's, or the only one.
 
         Args:
             explain: returns the reason for a datagram that is not from the LiDAR; "" for one that is.
             what: description of the LiDAR, for messages.
-            lidar: its name in the profile.
+            lidar: the LiDAR's name in the profile.
             driver: its `driver` there.
 
         Raises:

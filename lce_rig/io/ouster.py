@@ -23,17 +23,17 @@ from lce_rig.io.network import FRAME_BYTES, PcapFile
 from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
-# Minimum share of a scan's columns that must arrive.
+# Minimum fraction of a scan's columns that must arrive.
 _MIN_COVERAGE = 0.5
 
 
 class Profile(NamedTuple):
-    """How a profile lays out packets.
+    """Packet layout of a profile.
 
     Attributes:
         pixel: one return.
-        unit_m: of its range.
-        range_mask: of the bits that hold the range.
+        unit_m: unit of its range.
+        range_mask: mask of the bits that hold the range.
         has_heads: whether packets have a head and a foot, and a column's status is in its head.
     """
 
@@ -64,12 +64,12 @@ PROFILES = {
 
 @dataclass(frozen=True, eq=False)
 class OusterMetadata:
-    """The sensor's metadata, as far as its packets need them.
+    """The sensor's metadata needed to decode its packets.
 
     Attributes:
-        name: of its profile.
+        name: name of its profile.
         n_columns: columns of a revolution.
-        columns_per_packet: of one packet.
+        columns_per_packet: columns of one packet.
         altitude_rad, azimuth_rad: (L,) of each beam, from the top.
         origin_m: (2,) distance of the beams' origins from the axis, and their height.
         T_sensor_lidar: (4, 4), m.
@@ -124,7 +124,7 @@ class OusterMetadata:
 
 
 def read_metadata(path: Path) -> OusterMetadata:
-    """Read the JSON file that Ouster's tools write beside a recording.
+    """Read the JSON metadata file that Ouster's tools write beside a recording.
 
     Raises:
         SourceError: it cannot be read, is not one, or its packets' profile is not read.
@@ -164,7 +164,7 @@ def _matrix(values: Any) -> Array:
 
 
 class OusterRecording:
-    """The scans of one Ouster in a recording of the network, one a frame.
+    """The scans of one Ouster in a recording of the network, one per frame.
 
     Attributes:
         path: the file.
@@ -185,7 +185,7 @@ class OusterRecording:
         self._file = PcapFile(path)
         self._lidar = choose_lidar(rig, options, self.notes)
         self._settings: LidarSettings = rig.lidars[self._lidar]
-        # The metadata are the file of the recording's name, else the only JSON file beside it.
+        # Metadata: the file with the recording's name, else the only JSON file beside it.
         beside = path.with_suffix(".json")
         others = sorted(path.parent.glob("*.json"))
         if not beside.is_file() and len(others) != 1:
@@ -232,7 +232,7 @@ class OusterRecording:
         """Yield the packets of each frame, and the arrival of the first."""
         packets: list[bytes] = []
         frame, first_host_ns = -1, 0
-        # A frame that never ends is damage.
+        # A frame without an end is damaged.
         most = 2 * -(-self._metadata.n_columns // self._metadata.columns_per_packet)
         for datagram in self._file.datagrams():
             is_ours = (datagram.source, datagram.port) == self._sender

@@ -1,4 +1,4 @@
-"""The interface of every recording, the sensors that its data belong to, and recordings read as one."""
+"""The interface of all recordings, their assignment to sensors, and recordings read together."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -22,10 +22,10 @@ _SINCE_1970_S = 1e9
 _CLOCK_JUMP_NS = 1_000_000_000
 # Gap below which streams count as overlapping, s: sensors start one after the other.
 _ROUGH_S = 0.2
-# Units that timestamps of events are mistaken for, and the largest relative difference of the durations.
+# Possible wrong units of event timestamps, and the largest relative difference of the durations.
 _UNITS = (1_000, 1_000_000, 1_000_000_000)
 _UNIT_TOLERANCE = 0.2
-# Duration from which that is checked while packets come, so that no captures are made of them.
+# Duration after which this is checked during reading, so that no captures are made from such events.
 _UNIT_CHECK_NS = 2_000_000_000
 # Sensors are switched on and off one after the other.
 _USUAL_LAG_S = 2.0
@@ -50,7 +50,7 @@ class SourceOptions:
 
 
 class Recording(Protocol):
-    """Anything recorded.
+    """Any recording.
 
     Attributes:
         path: file or folder.
@@ -89,7 +89,7 @@ def serials_of(recording: Recording) -> dict[str, str]:
 
 
 def fingerprint(files: Iterable[Path]) -> str:
-    """Hash names, sizes and both ends of files: enough to know a recording again, wherever it lies."""
+    """Hash names, sizes and both ends of files, which identify a recording in any folder."""
     digest = hashlib.sha256()
     for file in files:
         size = file.stat().st_size
@@ -103,7 +103,7 @@ def fingerprint(files: Iterable[Path]) -> str:
 def choose_camera(
     rig: Rig, options: SourceOptions, notes: list[str], camera: str | None = None
 ) -> tuple[str, str]:
-    """Choose the (camera, channel) of a folder's images: as asked, else the rig's only camera.
+    """Choose the (camera, channel) of a folder's images: as requested, else the rig's only camera.
 
     Args:
         rig: the profile.
@@ -117,7 +117,7 @@ def choose_camera(
     camera = camera or options.camera
     if camera is None:
         camera, *others = rig.cameras
-        if others:  # Images assigned to the wrong camera would spoil both extrinsics.
+        if others:  # Images assigned to the wrong camera would corrupt both extrinsics.
             raise SourceError(
                 f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
                 f"Name it with --camera {camera}, or put each camera's images into a folder of its name: "
@@ -135,7 +135,7 @@ def choose_camera(
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
-    """Choose the LiDAR of a folder's point clouds: as asked, else the rig's first.
+    """Choose the LiDAR of a folder's point clouds: as requested, else the rig's first.
 
     Raises:
         SourceError: the rig has no such LiDAR.
@@ -151,7 +151,7 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
 
 
 def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
-    """Choose the (camera, channel) of a file of events: as asked, else the first with events.
+    """Choose the (camera, channel) of an event file: as requested, else the first with events.
 
     Raises:
         SourceError: the rig has no camera with a channel of kind events, or not the one asked for.
@@ -172,7 +172,7 @@ def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> t
 
 
 def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sample]:
-    """Yield the samples of all parts, the earliest first; each part's own order is kept.
+    """Merge the samples of all parts by time; each part's own order is kept.
 
     Packets of events count by their first timestamp. Only one sample of each part is held.
 
@@ -199,7 +199,7 @@ def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sampl
 
 
 def follows(stamp_ns: int | None, last_ns: int | None, losses: Losses) -> bool:
-    """Return whether a sample comes after the one before it; count those sent twice or late, to be skipped.
+    """Check whether a sample comes after its predecessor; count duplicate and late ones, to be skipped.
 
     A timestamp that is earlier by more than a second is that of a clock that was set: it begins again.
     """
@@ -211,11 +211,11 @@ def follows(stamp_ns: int | None, last_ns: int | None, losses: Losses) -> bool:
 
 
 def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iterator[Sample]:
-    """Pass samples on; at their end, check that images and events ran while a LiDAR did.
+    """Pass samples on; at the end, check that images and events overlap with a LiDAR's scans.
 
     Args:
-        samples: of a whole recording.
-        rig: its `expected_offset_s` are added to the timestamps.
+        samples: samples of a whole recording.
+        rig: profile whose `expected_offset_s` are added to the timestamps.
         notes: receives the streams that cover only a part of the scans.
 
     Raises:
@@ -253,7 +253,7 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
         if overlap_s < -_ROUGH_S:
             key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
             hint = "Record both at the same time on one computer's clock, preferably into one bag."
-            if abs(scan_0 - first) <= 3600.0:  # further apart, they are of two recordings
+            if abs(scan_0 - first) <= 3600.0:  # further apart, they belong to two recordings
                 hint = (
                     "If they were recorded together, add the difference of their clocks to "
                     f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
@@ -277,7 +277,7 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
 
 
 def read_samples(recording: ContinuousRecording, rig: Rig, progress: Progress) -> Iterator[Sample]:
-    """Read a whole recording as `check_overlap` does; events do not count in its progress."""
+    """Read a whole recording, as in `check_overlap`; events do not count in the progress."""
     done = 0
     for sample in check_overlap(recording.samples(), rig, recording.notes):
         yield sample
@@ -304,7 +304,7 @@ def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: 
 
 
 def join_recordings(recordings: Sequence[Recording], rig: Rig) -> list[Recording]:
-    """Join continuous recordings of the same moment, in the order given.
+    """Join simultaneous continuous recordings, in the given order.
 
     A recording belongs to those before it if it repeats no LiDAR, and either adds a sensor or no later
     recording holds only a LiDAR. Other repeated sensors are skipped.
@@ -368,7 +368,7 @@ class JoinedRecording:
     """Several simultaneous recordings; see `ContinuousRecording`.
 
     Attributes:
-        path: of the first.
+        path: path of the first recording.
         notes: those of all, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.
@@ -404,7 +404,7 @@ class JoinedRecording:
             self.notes += [n for part in self._parts for n in part.notes if n not in self.notes]
 
     def _owned(self, part: ContinuousRecording) -> Iterator[Sample]:
-        """Yield the samples of the streams that are read from a part."""
+        """Yield the samples of the streams read from a part."""
         return (
             sample for sample in part.samples() if self._owner.get(stream_of(sample, self._rig), part) is part
         )

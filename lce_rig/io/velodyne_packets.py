@@ -1,4 +1,4 @@
-"""Packets of a Velodyne, checked and ordered by its counter, and its clock; UDP delivers anything sent."""
+"""Velodyne packets, checked and ordered by the sensor's counter, and its clock; UDP may deliver anything."""
 
 import re
 import struct
@@ -30,7 +30,7 @@ _RMC = re.compile(
 
 
 class BadPacketError(ValueError):
-    """A payload that is not a packet of the LiDAR; `model` names the Velodyne whose packet it is, if any."""
+    """A payload that is not a packet of the LiDAR; `model` names the Velodyne that sent it, if any."""
 
     def __init__(self, what: str, model: str = "") -> None:
         super().__init__(what)
@@ -44,7 +44,7 @@ class DataPacket:
     Attributes:
         host_ns: arrival at the host; 0 where unknown.
         us: time of the first firing past the hour, on the sensor's counter.
-        mode: of velodyne.RETURN_MODES.
+        mode: return mode, a key of velodyne.RETURN_MODES.
         product: the model that sent it.
         azimuth: (12,) int64 of each block, 0.01 deg clockwise from the lidar frame's x axis.
         fields: () of velodyne.DATA_PACKET.
@@ -94,13 +94,13 @@ class PositionPacket(NamedTuple):
 def read_data_packet(
     payload: bytes | memoryview, host_ns: int, wanted: velodyne.Product = velodyne.READ[0]
 ) -> DataPacket:
-    """Check a payload in every way its layout allows.
+    """Check everything in a payload that its layout determines.
 
     Ranges and reflectivities can have any value; everything else is bound: flags, azimuths that rise evenly,
     a time within the hour, known factory bytes.
 
     Args:
-        payload: of the UDP packet.
+        payload: payload of the UDP packet.
         host_ns: its arrival; 0 where unknown.
         wanted: the model whose packets are read.
 
@@ -129,7 +129,7 @@ def read_data_packet(
 
 
 def _is_even(azimuth: Sequence[int], is_dual: bool, block_ns: int) -> bool:
-    """Return whether 12 blocks advance as those of a turning rotor."""
+    """Check whether 12 blocks advance like those of a rotating rotor."""
     steps = [(b - a) % velodyne.AZIMUTH_STEPS for a, b in pairwise(azimuth)]
     if is_dual:
         if any(steps[0::2]):
@@ -161,7 +161,7 @@ def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
 
 
 def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
-    """Find second past the hour and status of a sentence whose checksum is right."""
+    """Extract the seconds past the hour and the status from a sentence with a valid checksum."""
     match = _RMC.match(raw)
     if match is None:
         return None, False
@@ -173,19 +173,19 @@ def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
     return 60 * minute + second, match[4] == b"A"
 
 
-#: Clocks further apart than this do not both show UTC.
+#: Largest difference of two clocks that both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
 # Position packets arrive 50 to 150 times per second and repeat a sentence until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
-# The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
-# the lower quartile is safe from late arrivals and from a damaged packet.
+# The host's time of a firing is best given by the least delayed arrival in 0.1 s. The lower quartile of
+# twenty of them is robust to late arrivals and a damaged packet.
 _WINDOW_NS = 100_000_000
 _N_WINDOWS = 20
 
 
 class VelodyneClock:
-    """Keeps the sensor's counter, its position packets and the host's clock together.
+    """Relates the sensor's counter, its position packets and the host's clock.
 
     The counter in the packets runs free from power-up, and looks no different then: only pulses and
     sentences, which the position packets report, tie it to UTC. The hour is never sent.
@@ -202,7 +202,7 @@ class VelodyneClock:
         self._last_elapsed_ns = 0
 
     def restart(self) -> None:
-        """Forget the delays between counter and host: the counter was set."""
+        """Discard the delays between counter and host after the counter was set."""
         self._delays_ns.clear()
 
     def see_data(self, packet: DataPacket, elapsed_ns: int) -> None:
@@ -210,7 +210,7 @@ class VelodyneClock:
 
         Args:
             packet: in its place.
-            elapsed_ns: of the counter since any fixed moment.
+            elapsed_ns: reading of the counter since any fixed moment.
         """
         self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
         if not packet.host_ns:
@@ -222,7 +222,7 @@ class VelodyneClock:
         self._delays_ns.append((window, delay_ns))
 
     def ahead_ns(self) -> int | None:
-        """Compute the lead of the sensor's time over the host's, ns; None if the host's is unknown.
+        """Compute how far the sensor's time is ahead of the host's, ns; None if the host's is unknown.
 
         The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
         arrival. The result is the host's time of the first firing, late by the network's delay.
@@ -231,7 +231,7 @@ class VelodyneClock:
         return None if host_ns is None else resolve_hour(1000 * self._last_us, host_ns) - host_ns
 
     def stamp_ns(self, elapsed_ns: int) -> int | None:
-        """Return the time of a counter value, ns: the sensor's time if it can be trusted, else the host's."""
+        """Return the time of a counter value, ns: the sensor's time if reliable, else the host's."""
         host_ns = self._host_ns(elapsed_ns)
         if host_ns is None or not self.is_utc:
             return host_ns
@@ -252,7 +252,7 @@ class VelodyneClock:
         return self._state()(**figures)
 
     def _state(self) -> Kind:
-        """Find the first reason not to trust the sensor's time.
+        """Find the first reason against using the sensor's time.
 
         It is trusted if the clock is locked to pulses, the NMEA sentence matches the second of the counter,
         and the host's clock agrees.

@@ -1,4 +1,4 @@
-"""From a stream of Velodyne packets, live or recorded, to scans of one revolution each.
+"""Convert a stream of Velodyne packets, live or recorded, to scans of one revolution each.
 
 velodyne-decoder computes the points. Two of its choices matter: it adds the vertical offsets of the lasers
 (up to 11 mm, which ROS 1 drivers omit), and between two azimuths takes the rotor's mean speed over the
@@ -36,10 +36,10 @@ OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
-# Packets ahead that are accepted without the host's clock; beyond, both clocks must agree.
+# Number of packets ahead that are accepted without the host's clock; above it, both clocks must agree.
 _MAX_BLIND = 4
 _MAX_DISAGREEMENT_NS = 20_000_000
-# Minimum share of a scan's packets that must arrive.
+# Minimum fraction of a scan's packets that must arrive.
 _MIN_COVERAGE = 0.5
 
 
@@ -77,7 +77,7 @@ class _Piece(NamedTuple):
 
     Attributes:
         packet: the whole packet.
-        elapsed_ns: of the counter at the packet's first firing.
+        elapsed_ns: reading of the counter at the packet's first firing.
         blocks: the slice of its blocks.
     """
 
@@ -95,7 +95,7 @@ class Vlp16Stream:
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
         product: the model whose packets are decoded.
         other_models: data packets of other models, by name.
-        clock: of the timestamps.
+        clock: clock of the timestamps.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
 
@@ -156,7 +156,7 @@ class Vlp16Stream:
         """Decode a data packet; return the scan that it completes. A bad one is counted.
 
         Args:
-            payload: of the UDP packet.
+            payload: payload of the UDP packet.
             host_ns: its arrival; 0 where unknown.
         """
         try:
@@ -191,7 +191,7 @@ class Vlp16Stream:
         return None
 
     def _place(self, packet: DataPacket) -> Literal["next", "late", "after a step"]:
-        """Compare the sensor's counter with the host's clock since the packet before.
+        """Compare the sensor's counter with the host's clock since the previous packet.
 
         Returns:
             "late" for a packet to skip: it was sent before another that has arrived, or twice;
@@ -200,7 +200,7 @@ class Vlp16Stream:
         last, self._last = self._last, packet
         if last is None:
             return "next"
-        # The shorter way around the hour.
+        # Shortest difference, modulo one hour.
         half_us = velodyne.HOUR_US // 2
         step_ns = 1000 * ((packet.us - last.us + half_us) % velodyne.HOUR_US - half_us)
         n_ahead = round(step_ns / packet.packet_ns)
@@ -302,7 +302,7 @@ class Vlp16Stream:
 
 
 def keep_brighter(packets: NDArray[np.void]) -> None:
-    """Blank the darker of two returns in dual-mode packets (P,), or the last of two equal ones.
+    """Blank the weaker of two returns in dual-mode packets (P,), or the last of two equal ones.
 
     At the board's rim, board and wall may both answer one pulse; the sensor reports the brighter answer in
     its strongest mode.
@@ -349,7 +349,7 @@ class PcapRecording:
         self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
 
     def samples(self) -> Iterator[Scan]:
-        """Yield the scans, in order of time; packets that are damaged, late or lost are counted in `notes`.
+        """Yield the scans in order of time; damaged, late and lost packets are counted in `notes`.
 
         Raises:
             SourceError: not one whole revolution was recorded.

@@ -40,16 +40,16 @@ from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_H
 _BIAS = np.repeat([0.005, np.radians(0.1)], 3)
 _THRESHOLD_SIGMAS = 3.0  # of the change of one axis
 _POWER_SIGMAS = 1.645  # 95 % of the trials at the smallest change exceed the threshold.
-# Smallest detectable change, m and rad, beyond which the boards' opinion is unknown.
+# Largest useful detectable change, m and rad; above it, the boards' result is unknown.
 _LARGEST = np.repeat([0.10, np.radians(1.5)], 3)
-_MIN_PLACEMENTS = 3  # Fewer do not determine the scatter.
+_MIN_PLACEMENTS = 3  # Minimum number to determine the scatter.
 # Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
 _CHANGED_CHI2 = 22.46
 
 
 @dataclass(frozen=True)
 class AxisDrift:
-    """The boards' opinion on extrinsics along one axis, the others unchanged.
+    """Result of the boards for one axis of the extrinsics, with the other axes unchanged.
 
     Attributes:
         axis: "translation_x" to "rotation_z", axes of the camera.
@@ -67,12 +67,12 @@ class AxisDrift:
 
     @property
     def figures(self) -> dict[str, float]:
-        """The figures by their names with the unit, as findings hold them."""
+        """Figures by name with unit, as in findings."""
         unit = "deg" if self.axis.startswith("rotation") else "m"
         return {f"{name}_{unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         return {"axis": self.axis, "state": self.state, **self.figures}
 
 
@@ -103,7 +103,7 @@ class JointDrift(JointDifference):
 
     @property
     def hidden(self) -> Finding:
-        """The largest change that the boards would not show, along their least determined direction."""
+        """Largest change that the boards cannot detect, along their least determined direction."""
         variances, directions = self.directions
         # A shift of the mean by this much exceeds the threshold in about 95 % of trials.
         size = np.sqrt(_CHANGED_CHI2) + _POWER_SIGMAS
@@ -135,7 +135,7 @@ class BoardDrift:
     joint: JointDrift
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         return {
             "state": self.state,
             "n_boards": self.n_boards,
@@ -178,8 +178,8 @@ def watch_boards(
     Args:
         rig: the profile.
         calibration: the deployed extrinsics.
-        channel: of the images.
-        detections: of the captures.
+        channel: channel of the images.
+        detections: detections of the captures.
 
     Returns:
         None if both sensors see the board at about the same place in fewer than three placements.
@@ -204,8 +204,8 @@ def watch_boards(
     change = difference(estimate.T_cam_lidar[0], T_cam_lidar)
     axes = [_judge(axis, change, cov) for axis in range(6)]
     if sum(axis.state == "changed" for axis in axes) > 1:
-        # One changed axis looks like several: the one that explains most is changed, the others are judged
-        # without its change.
+        # One changed axis looks like several: report the one that explains most, and judge the others without
+        # its change.
         alone = [_alone(axis, change, cov) for axis in range(6)]
         first = int(np.argmax([size**2 / variance for size, variance in alone]))
         rest = change - alone[first][0] * np.eye(6)[first]

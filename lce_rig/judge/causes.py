@@ -43,10 +43,10 @@ _CHANCE = 1e-3
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
-    """Weigh all captures of an estimate fully, to test explanations of them; None if they are too few.
+    """Give all captures of an estimate full weight, to test explanations; None if there are too few.
 
     Args:
-        estimate: of any method.
+        estimate: estimate of any method.
         rejected: captures with the board in both sensors that the estimate does not use.
     """
     if estimate.joint is None or len(estimate.observations) < _FEWEST:
@@ -69,7 +69,7 @@ def find_causes(
 
     Args:
         hypothesis: the likelihood of its captures.
-        estimate: of any method.
+        estimate: estimate of any method.
         target: target standard deviations.
         causes: to test; only mountings for two LiDARs, or two cameras.
     """
@@ -82,7 +82,7 @@ def find_causes(
 
 
 def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
-    """Measure the change from the extrinsics in use, where these are significantly off.
+    """Measure the change relative to the extrinsics in use, if these are significantly wrong.
 
     Algorithm 1 estimates no constant errors, so its extrinsics may be farther off than the likelihood's.
     """
@@ -114,7 +114,7 @@ def cause_findings(
 
 
 def is_explained(selected: Sequence[Selected]) -> bool:
-    """Check whether the causes leave about the usual noise, so that symptoms follow from them."""
+    """Check whether the causes leave about the usual noise, so that symptoms can follow from them."""
     return bool(selected) and selected[-1].after.with_fitted_noise.levels.largest_of_images < _USUAL
 
 

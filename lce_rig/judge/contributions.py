@@ -42,7 +42,7 @@ def list_contributions(
     sensitivities: Sequence[Sensitivity],
     contradictions: Sequence[Sensitivity],
 ) -> tuple[Contribution, ...]:
-    """List the causes of the reported standard deviations, the largest translation first."""
+    """List the causes of the reported standard deviations, the largest in translation first."""
     parts = [
         Contribution("captures", figures.sigma_scatter_rotation_deg, figures.sigma_scatter_translation_m),
         Contribution(

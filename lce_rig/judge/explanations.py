@@ -102,10 +102,10 @@ _MEDIAN_CHI2 = 5.348  # of six degrees of freedom
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A cause that may explain why captures disagree.
+    """A possible cause of disagreement between captures.
 
     Attributes:
-        cause: its kind.
+        cause: the cause's kind.
         weights: (F,) w of (1).
         n_tried: number of explanations of this kind.
         cut: index of the first capture after a move ("moved"), or of another board ("two_boards").
@@ -118,7 +118,7 @@ class Explanation:
 
 
 class Gain(NamedTuple):
-    """The fall of the cost by an explanation, and its significance.
+    """Decrease of the cost by an explanation, and its significance.
 
     Attributes:
         explanation: the explanation.
@@ -142,7 +142,7 @@ class Selected(NamedTuple):
     """An explanation that was assumed.
 
     Attributes:
-        gain: its significance and estimate.
+        gain: the gain's significance and estimate.
         change: (6,) tangent (translation m, rotation rad) by which it changes the extrinsics. For mountings:
             from before to after, or from the rest to the group.
         after: the likelihood with it.
@@ -179,7 +179,7 @@ class Poses(NamedTuple):
         return weights @ self.gradient, hessian - by_z.T @ self.inverse @ by_z
 
     def singles(self, gradient: Array) -> Array:
-        """Compute the fall of each capture's cost (F,) with extrinsics of its own: chi-squared, 6 freedoms.
+        """Compute each capture's decrease in cost (F,) with separate extrinsics: chi-squared, 6 d.o.f.
 
         Args:
             gradient: (F, 6) at the optimum.
@@ -205,12 +205,12 @@ class Poses(NamedTuple):
         F = len(self.gradient)
         order, cuts = np.arange(F), range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1)
         for cut in cuts:
-            # The smaller side gets the mounting of its own.
+            # Assign the separate mounting to the smaller side.
             is_own = order < cut if 2 * cut < F else order >= cut
             yield Explanation("moved", is_own.astype(np.float64), len(cuts), cut)
 
     def candidates(self) -> Iterator[Explanation]:
-        """List moves before each capture, single captures, the two groups that differ most, and a drift."""
+        """List candidates: moves at each capture, single captures, the two most different groups, a drift."""
         yield from self.moves()
         F = len(self.gradient)
         order = np.arange(F)
@@ -272,7 +272,7 @@ class Table:
 
     @cached_property
     def step(self) -> Array:
-        """(G,) step from the expansion point to the optimum."""
+        """Step (G,) from the expansion point to the optimum."""
         return np.asarray(-self.inverse @ self.hypothesis.reduced.gradient)
 
     @cached_property
@@ -348,7 +348,7 @@ class Table:
         return _gain(explanation, h, hessian - by_z.T @ self.inverse @ by_z, sigma)
 
     def _columns(self, cause: Cause) -> Array:
-        """Return D (G, n) of a constant error."""
+        """Return D (G, n) for a constant error."""
         layout = self.hypothesis.state.layout
         every = np.eye(layout.z.size)
         if cause == "range_offset":
@@ -400,7 +400,7 @@ def log10_chance(chi2: float, freedoms: int) -> float:
 
 
 def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selected]:
-    """Assume explanations until none is significant.
+    """Assume explanations one after the other until none is significant.
 
     Args:
         hypothesis: the assumptions of the estimate.
@@ -417,7 +417,8 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
             return
         noisy = hypothesis.with_fitted_noise
         tried = [*Table(noisy, left).rows()[:1], rows[0], *late]
-        # Causes that are alike at usual noise: settled, one may be much more probable than the other.
+        # Causes that are similar at usual noise: after refitting, one may be much more probable than the
+        # other.
         alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
         tried += [r for r in rows if r.cause in alike and r.log10_chance < _LIKELY * rows[0].log10_chance]
         if rows[0].cause != "drift":
@@ -438,7 +439,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
 
 
 def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
-    """Settle under an explanation; compare deviances with noise fitted with and without it."""
+    """Refit under an explanation; compare deviances with noise fitted with and without it."""
     if row.cause in _FREED:
         after = now.under(priors=replace(now.priors, **_FREED[row.cause]))
         change = difference(after.T_in_use, now.T_in_use)
@@ -448,7 +449,7 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
         chance = row.log10_chance / unit if unit < _MOVING**2 else 0.0
         change = row.value if row.cause == "drift" else np.zeros(6)
         if row.cause in _OF_SQUARES:
-            # Boards are as much farther away.
+            # Boards are farther away by the same factor.
             change[2] = float(row.value[0]) * float(np.mean(now.images.T_cam_board[:, 2, 3]))
         return Selected(row._replace(log10_chance=chance), change, now)
     else:
@@ -466,7 +467,7 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
 
 
 def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array]:
-    """Settle with a mounting of their own for some captures.
+    """Refit with a separate mounting for some captures.
 
     Returns:
         The likelihood, and the change (6,) of the extrinsics from before to after, or from the rest to the
@@ -487,7 +488,7 @@ def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array]:
 
 
 def _agree(after: Hypothesis, members: NDArray[np.bool_]) -> bool:
-    """Check whether most captures of a group fit its mounting; those with errors of their own do not."""
+    """Check whether most captures of a group fit its mounting; those with individual errors do not."""
     poses = Table(after, frozenset()).poses
     singles = poses.singles(poses.gradient)
     unit = _unit(singles[~members])
@@ -496,7 +497,7 @@ def _agree(after: Hypothesis, members: NDArray[np.bool_]) -> bool:
 
 
 def find_change(cost: Quadratics) -> Gain | None:
-    """Look for a change of the extrinsics during the session, from costs of F captures in these alone.
+    """Search for a change of the extrinsics during the session, from costs of F captures in these alone.
 
     The noise of these costs is unknown and estimated from single captures, with the change removed.
 

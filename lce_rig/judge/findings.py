@@ -45,7 +45,7 @@ _LACKS = {
     ("verdict.not_certified", ""),
 }
 """Code and action of findings against which more captures help."""
-# Causes of which some images are at wrong places or times, and findings that these bring about.
+# Causes with images at wrong places or times, and the findings that result from them.
 _BROUGHT_ABOUT: Mapping[str, Collection[str]] = {
     "verdict.channels_turned": ("verdict.time_offset", "verdict.scatter", "verdict.moved", "verdict.drift"),
     "verdict.time_offset": ("verdict.scatter",),
@@ -160,7 +160,7 @@ FAIL_FACTOR = 3.0
 
 
 def failing(is_fail: bool) -> Severity:
-    """Return the severity of a finding that prevents a pass: an error if the result fails by it."""
+    """Return "error" for a finding that fails the result, else "warning"."""
     return "error" if is_fail else "warning"
 
 

@@ -121,7 +121,7 @@ class IntrinsicsCheck:
 
     @property
     def _sure(self) -> float:
-        """Number of standard deviations that is significant, with few captures more than for a normal one."""
+        """Significance threshold in standard deviations, larger with few captures."""
         from scipy.special import stdtrit  # scipy.stats takes a second to import
 
         return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))
@@ -133,7 +133,7 @@ def check_intrinsics(
     """Compare intrinsics with the corners of detected boards.
 
     Args:
-        image_boards: of one camera, by capture and channel.
+        image_boards: image boards of one camera, by capture and channel.
         intrinsics: the intrinsics to check.
         board: the board.
 
@@ -153,7 +153,7 @@ def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board
     """Compare intrinsics with fitted ones.
 
     Args:
-        fitted: of any model.
+        fitted: the fitted intrinsics, of any model.
         intrinsics: the intrinsics to check, at the same resolution.
         board: the board.
     """
@@ -192,7 +192,7 @@ def judge_lens(
 
     Args:
         covered: share of the image in which boards were seen.
-        image_sigma_px: of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
+        image_sigma_px: uncertainty of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
         check: the profile's intrinsics compared with them; None if they are for another resolution.
         target_deg: target standard deviation of the extrinsics' rotation.
 
@@ -213,7 +213,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
     """Return the finding of given intrinsics that do not fit, with their difference; else none.
 
     Args:
-        check: of the intrinsics.
+        check: result for the intrinsics.
         target_deg: target standard deviation of the extrinsics' rotation.
     """
     if check is None or check.verdict(target_deg) == "pass":
@@ -227,7 +227,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
     }
     severity, action = failing(check.verdict(target_deg) == "fail"), ""
     if check.surprise is not None:
-        # The result has the fitted intrinsics; only a lens that is hardly the profile's is a doubt.
+        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is reported.
         severity = "warning" if check.surprise > _OTHER_LENS else "note"
         action = "" if severity == "warning" else "weighed"
     elif judgement.code == "intrinsics.undetermined":
@@ -236,11 +236,11 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
-    """Try moving rows, and other lens models where corners do not fit as well as their noise allows.
+    """Test for moving rows, and for other lens models if corners fit worse than their noise allows.
 
     Args:
         fitted: intrinsics of the profile's model.
-        board: its specification.
+        board: the board's specification.
 
     Returns:
         None where the corners fit, or where the same model fits them with values of its own; else the
@@ -261,7 +261,7 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
             start = fitted.intrinsics
             reached[name] = estimate_intrinsics(fitted.views, board, start, model, n_folds=0).rms_px
     own, least_px = fitted.model.name, min(reached.values(), default=np.inf)
-    # Of models that are about as near the one with the fewest parameters.
+    # Among models that fit about equally well, choose the one with the fewest parameters.
     near = [name for name, px in reached.items() if px < _ALIKE * least_px]
     best = min(near, key=lambda name: MODELS[name].size, default="")
     if _NEARER * least_px > fitted.rms_px:

@@ -1,4 +1,4 @@
-"""Which sensor of a rig moved during the session, by the captures of all pairs together.
+"""Find the sensor of a rig that moved during the session, from the captures of all pairs together.
 
 A sensor that moved changes the extrinsics of all its pairs by one motion, and those of no other pair. With h
 and S of `explanations` (2) for pair p, and A_p the derivative of its extrinsics by the sensor's motion s, the
@@ -56,7 +56,7 @@ class PairCosts:
         validation: Validation,
         T_view: Array | None = None,
     ) -> "PairCosts":
-        """Take them from an estimate and its checks; T_view None for the first sensor's own frame."""
+        """Collect captures and costs of an estimate and its checks; T_view None: the first sensor's frame."""
         T_view = np.eye(4) if T_view is None else T_view
         T_first_second = np.asarray(invert(T_view) @ estimate.T_cam_lidar)
         reasons = [f for f in validation.causes if f.code == MOVED.code and f.severity != "note"]
@@ -76,7 +76,7 @@ class MovedSensor:
     """A sensor that moved.
 
     Attributes:
-        name: of the sensor.
+        name: name of the sensor.
         first_after: the first capture after its motion.
         log10_chance: log10 of the probability of such a fall of the cost without a motion.
         shown: the motion as captures of one of its pairs show it.
@@ -92,7 +92,7 @@ class MovedSensor:
         return self.name in pair.sensors and min(pair.used) < self.first_after
 
     def finding(self, pair: PairCosts) -> Finding:
-        """Report the motion for a pair of this sensor: a note if its result is of the mounting since."""
+        """Report the motion for a pair of this sensor: a note if its result uses only captures after it."""
         held = pair.used if pair.hypothesis is None else pair.hypothesis.captures
         before = tuple(name for name in held if name < self.first_after)
         after = tuple(name for name in held if name >= self.first_after)
@@ -135,7 +135,7 @@ def find_moved_sensor(pairs: Sequence[PairCosts]) -> MovedSensor | None:
     """Find the sensor whose motion explains the captures of all pairs best.
 
     Args:
-        pairs: of a rig.
+        pairs: pairs of a rig.
 
     Returns:
         The sensor; None if no pair's captures show a motion, or if several sensors explain them as well.

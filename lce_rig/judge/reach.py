@@ -1,4 +1,4 @@
-"""The effect of the errors of extrinsics and intrinsics together on a point measured by the LiDAR.
+"""Combined effect of errors of extrinsics and intrinsics on a point measured by the LiDAR.
 
 A point p = R q + t in the camera frame moves with the extrinsics by [I, -(p - t)^] times their tangent, as a
 rotation moves it about the LiDAR's origin; its pixel moves with the intrinsics as well. Both errors are
@@ -26,7 +26,7 @@ _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
 
 @dataclass(frozen=True, eq=False)
 class JointDifference(PoseDifference):
-    """The difference of two extrinsics with its covariance, along the eigen-directions of that.
+    """Difference of two extrinsics with its covariance, along the eigenvectors of the latter.
 
     Attributes:
         lever_m: rms distance of the boards, which makes angles comparable with distances.
@@ -55,7 +55,7 @@ class JointDifference(PoseDifference):
 
     @property
     def scale(self) -> Array:
-        """(6,) displacement of the boards, m, per unit of each axis."""
+        """Displacement (6,) of the boards, m, per unit of each axis."""
         return np.asarray(np.r_[np.ones(3), np.full(3, self.lever_m)])
 
     @property
@@ -66,7 +66,7 @@ class JointDifference(PoseDifference):
 
 
 def covariance_alone(calibration: Calibration) -> Array:
-    """Compute the covariance (6, 6) of `T_cam_lidar` without the intrinsics that belong to it.
+    """Compute the covariance (6, 6) of `T_cam_lidar` for use without the result's intrinsics.
 
     Sessions have their own intrinsics each: where matrices are compared, the rotation by which the errors of
     the intrinsics are compensated counts in full.
@@ -79,12 +79,18 @@ def covariance_alone(calibration: Calibration) -> Array:
     return np.asarray(M @ with_lens(c.cov, c.intrinsics_cross_cov, c.intrinsics_cov) @ M.T)
 
 
-def as_used(calibration: Calibration, lens: Intrinsics) -> Array:
-    """Give the extrinsics (4, 4) that draw points with another lens as a result's own do with its intrinsics.
+def equivalent_extrinsics(calibration: Calibration, lens: Intrinsics) -> Array:
+    """Convert a result's extrinsics for use with other intrinsics.
+
+    With `lens`, the returned extrinsics project points to the same pixels as the result's extrinsics and
+    intrinsics do, up to the difference that no rotation absorbs.
 
     Args:
-        calibration: with its intrinsics; without, its extrinsics are returned unchanged.
-        lens: of the same camera model.
+        calibration: the result; without fitted intrinsics its extrinsics are returned unchanged.
+        lens: intrinsics of the same camera model.
+
+    Returns:
+        T_cam_lidar (4, 4).
     """
     fitted, model = calibration.intrinsics, model_of(lens)
     if fitted is None:
@@ -106,8 +112,8 @@ def point_uncertainties(
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) tangent (translation m, rotation rad), or (6 + P, 6 + P) `with_lens`.
-        lens: of the camera.
-        distances_m: of the points.
+        lens: intrinsics of the camera.
+        distances_m: distances of the points.
 
     Returns:
         One for each distance, with the worst of the four corners.
@@ -126,7 +132,7 @@ def point_uncertainties(
 
 
 def outermost_pixels(lens: Intrinsics) -> Array:
-    """Find the image's corners (4, 2), or where the lens ends on the way to them from the middle."""
+    """Find the image's corners (4, 2), or the limits of the lens model on the way to them."""
     w, h = lens.width_px - 1.0, lens.height_px - 1.0
     middle = np.array([w / 2, h / 2])
     corners = []

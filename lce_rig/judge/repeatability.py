@@ -18,13 +18,13 @@ from lce_rig.core.geometry import (
     tangent_sizes,
 )
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE
-from lce_rig.judge.reach import JointDifference, as_used, covariance_alone
+from lce_rig.judge.reach import JointDifference, covariance_alone, equivalent_extrinsics
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
 # If correct ones spread farther with more than this probability, reported uncertainties are conservative.
 _GENEROUS = 0.95
-# Distance of boards that is assumed where results do not state it, m.
+# Assumed distance of boards in results that do not state it, m.
 _LEVER_M = 2.0
 
 
@@ -58,7 +58,7 @@ class Repeatability:
     """Several calibrations of the same sensors, compared.
 
     Attributes:
-        names: of the sessions, or of the results of one session.
+        names: names of the sessions, or of the results of one session.
         camera, lidar: the calibrated sensors.
         T_cam_lidar: (4, 4) mean with equal weights, of extrinsics for the first one's intrinsics.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
@@ -67,7 +67,7 @@ class Repeatability:
         chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
         dof: its mean if these are right.
         p: probability that correct calibrations spread this far or farther.
-        differences: of each pair.
+        differences: differences of each pair.
         odd_one: the session without which the others agree; None if all agree or none can be identified.
         are_independent: whether each has its own captures. If not, common errors stay hidden, and chi2, dof
             and p are those of the pair that differs most, with p times the number of pairs.
@@ -132,7 +132,7 @@ class Repeatability:
 def compare_calibrations(
     calibrations: Mapping[str, Calibration], *, are_independent: bool = True
 ) -> Repeatability:
-    """Compare calibrations of the same camera and LiDAR, each with its own lens, as they draw points.
+    """Compare calibrations of the same camera and LiDAR by projected points, each with its own lens.
 
     Results of the same captures share errors to an unknown extent. For any correlation, the covariance of
     a - b is at most 2 (cov_a + cov_b), because that of a + b is not negative: this bound is used for them.
@@ -146,7 +146,9 @@ def compare_calibrations(
     lens, models = lenses[0], {each and (each.model, len(each.distortion)) for each in lenses}
     if lens is not None and len(models) == 1:
         # A session's extrinsics compensate the rotation of its own lens.
-        calibrations = {name: replace(c, T_cam_lidar=as_used(c, lens)) for name, c in calibrations.items()}
+        calibrations = {
+            name: replace(c, T_cam_lidar=equivalent_extrinsics(c, lens)) for name, c in calibrations.items()
+        }
         cov = np.array([calibrations[name].cov for name in names])
     else:
         cov = np.array([covariance_alone(calibrations[name]) for name in names])
@@ -177,7 +179,7 @@ def compare_calibrations(
         p = min(1.0, len(pairs) * chance_of(chi2, dof))
     blamed = []
     if are_independent and p < _CHANCE and len(names) > 2:
-        # Sessions without which the others agree.
+        # Sessions that must be removed for the others to agree.
         for k, name in enumerate(names):
             rest = np.arange(len(names)) != k
             if chance_of(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
@@ -219,7 +221,7 @@ def _displacements(first: Calibration, second: Calibration) -> dict[float, float
 
 
 def _spread(T: Array, cov: Array) -> float:
-    """Compute chi2: the least sum of squared Mahalanobis distances from one pose."""
+    """Compute chi2, the minimum sum of squared Mahalanobis distances from one pose."""
     weights = np.asarray(np.linalg.inv(cov))
     deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))

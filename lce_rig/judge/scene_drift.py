@@ -57,7 +57,7 @@ class SceneChange(JointDifference):
         }
 
     def _sigma(self, part: slice) -> float:
-        """Return the standard deviation along the direction of a part, (3,), of the change."""
+        """Return the standard deviation of the rotation or translation (`part`) along its direction."""
         direction = self.significant[part] / max(float(np.linalg.norm(self.significant[part])), 1e-12)
         return float(np.sqrt(direction @ self.cov[part, part] @ direction))
 
@@ -69,7 +69,7 @@ class SceneDrift:
     Attributes:
         T_cam_lidar: (4, 4) deployed.
         cov: (6, 6) of these.
-        estimate: of the scene.
+        estimate: estimate of the scene.
         n_captures: compared.
         gain: significance of an ambiguous estimate's score over that of the deployed extrinsics.
         others: further findings; clocks apart prevent an all-clear.
@@ -84,18 +84,18 @@ class SceneDrift:
 
     @property
     def change(self) -> SceneChange:
-        """From the deployed extrinsics to the estimate."""
+        """Tangent from the deployed extrinsics to the estimate."""
         tangent = difference(self.estimate.T_cam_lidar, self.T_cam_lidar)
         return SceneChange(tangent, self.estimate.cov + self.cov)
 
     @property
     def smallest(self) -> tuple[float, float]:
-        """The smallest rotation (deg) and translation (m) of any direction with which they would not hold."""
+        """Smallest rotation (deg) and translation (m) in any direction that would be detected."""
         return self.estimate.smallest_changes(self.cov)
 
     @property
     def judgement(self) -> Finding:
-        """The answer, or why there is none."""
+        """The answer, or the reason why it is unknown."""
         estimate, (smallest_deg, smallest_m) = self.estimate, self.smallest
         sizes = {"smallest_deg": smallest_deg, "smallest_m": smallest_m}
         if estimate.state == "few_edges":
@@ -127,7 +127,7 @@ class SceneDrift:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """The verdict first, or what prevents it."""
+        """The verdict, or the reason for having none, first."""
         judgement = self.judgement
         are_apart = CLOCKS_APART.code in (each.code for each in self.others)
         is_void = not self.n_captures or (are_apart and judgement.code == UNCHANGED.code)
@@ -135,7 +135,7 @@ class SceneDrift:
 
     @property
     def T_changed(self) -> Array:
-        """(4, 4) the deployed extrinsics, moved by the significant part of the change."""
+        """Deployed extrinsics (4, 4), moved by the significant part of the change."""
         return perturb(self.T_cam_lidar, self.change.significant)
 
     @property
@@ -147,7 +147,7 @@ class SceneDrift:
         return SceneOpinion(n_captures, n_edges, _OPINIONS[self.state], change.tangent, change.cov)
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         smallest_deg, smallest_m = self.smallest
         return {
             "state": self.state,
@@ -166,7 +166,7 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
 
     Args:
         views: the captures.
-        lens: of the camera.
+        lens: intrinsics of the camera.
         calibration: the extrinsics and their covariance.
     """
     c = calibration

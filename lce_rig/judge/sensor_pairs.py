@@ -1,4 +1,4 @@
-"""Two sensors that saw the same boards: whether their extrinsics agree, and their names are not exchanged.
+"""Check whether the extrinsics of two sensors that saw the same boards agree, or are exchanged.
 
 Each still board that two cameras see gives T_second_first = T_second_board T_first_board^-1 without any
 LiDAR. The extrinsics of both cameras with one LiDAR give the same pose independently.
@@ -48,7 +48,7 @@ from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig
 
-# Fewer placements do not determine the scatter.
+# Minimum number of placements to determine the scatter.
 _MIN_PLACEMENTS = 4
 # Fewer placements do not determine the shape of the scatter; that of typical errors is used.
 _MIN_JACKKNIFE = 10
@@ -66,8 +66,8 @@ class RelativePose:
             between placements.
         captures: (F,) that both cameras used, as the first names them.
         board_rms_m: rms distance between both cameras' positions of a board's middle.
-        scatter: of single boards about it, in typical standard deviations of poses in images.
-        expansion: of the cost about T_second_first, per capture.
+        scatter: scatter of single boards about it, in typical standard deviations of poses in images.
+        expansion: expansion of the cost about T_second_first, per capture.
         centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
@@ -104,7 +104,7 @@ def shared_boards(
 
     Args:
         first: observations by capture, of one camera.
-        second: of the other.
+        second: name of the other sensor.
     """
     there = {scan_key(observation): observation for observation in second.values()}
     found = [(observation, there.get(scan_key(observation))) for observation in first.values()]
@@ -188,12 +188,12 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
 
 
 class CameraEvidence(NamedTuple):
-    """A calibrated camera, as far as its name can be wrong.
+    """A calibrated camera, with the figures to detect exchanged names.
 
     Attributes:
-        name: of the camera.
+        name: name of the camera.
         T_cam_lidar, cov: its extrinsics, (4, 4) and (6, 6).
-        views: of the board in its images.
+        views: views of the board in its images.
         lens: the profile's lens compared with them.
     """
 
@@ -207,14 +207,14 @@ class CameraEvidence(NamedTuple):
 def find_exchanged_cameras(
     rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence
 ) -> list[Finding]:
-    """Find two cameras whose images came under each other's name.
+    """Find two cameras whose images are exchanged.
 
     Exchanged, they fit the profile better: the nominal poses by more than chance allows, tolerances taken as
     three standard deviations; or the lenses, where boards contradict both profiles.
 
     Args:
         rig: the profile, with both cameras.
-        lidar: of both.
+        lidar: name of the common LiDAR.
         first, second: the cameras.
     """
     reasons = []
@@ -235,7 +235,7 @@ def find_exchanged_cameras(
 
 
 def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> float:
-    """Compute the fall of chi-squared about the nominal poses if two cameras are exchanged."""
+    """Compute how much chi-squared about the nominal poses decreases if two cameras are exchanged."""
     nominal = [rig.nominal(each.name, lidar) for each in (first, second)]
     if None in nominal:
         return 0.0
@@ -255,7 +255,7 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
 
     Args:
         pair: the cameras.
-        names: of the first and the second.
+        names: names of the first and the second.
         target: standard deviations to reach.
     """
     if pair.from_images is None or pair.apart is None:
@@ -297,11 +297,11 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
 
 
 def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetection]) -> list[Finding]:
-    """Find a LiDAR whose scans have rings that its model lacks, as when two came under each other's name.
+    """Find a LiDAR with rings that its model lacks, for example because two LiDARs are exchanged.
 
     Args:
-        name: of the LiDAR.
-        lidar: its settings.
+        name: name of the LiDAR.
+        lidar: the LiDAR's settings.
         scans: its detections.
     """
     sheet = lidar.data_sheet()
@@ -318,15 +318,15 @@ def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetec
 def find_exchanged_lidars(
     T_first_second: Array, nominal: NominalExtrinsic | None, names: str, lidars: Sequence[LidarSettings]
 ) -> list[Finding]:
-    """Find two LiDARs whose scans came under each other's name.
+    """Find two LiDARs whose scans are exchanged.
 
     Exchanged, the estimate is the inverse, and boards fit as well. Without a nominal pose only the scans of a
     LiDAR with more rings show it; otherwise the result cannot pass.
 
     Args:
         T_first_second: (4, 4) the estimate.
-        nominal: of the profile.
-        names: of both.
+        nominal: nominal extrinsics of the profile.
+        names: names of both sensors.
         lidars: their settings.
     """
     if nominal is None:
@@ -346,7 +346,7 @@ class Loop(NamedTuple):
     """A sensor calibrated to two LiDARs, and these to each other.
 
     Attributes:
-        names: of the sensor and both LiDARs.
+        names: names of the sensor and both LiDARs.
         first, between, second: pose (4, 4) of the first LiDAR in the sensor's frame, of the second in the
             first one's, and of the second in the sensor's, each with its covariance (6, 6).
     """
@@ -364,7 +364,7 @@ class Loop(NamedTuple):
 
 
 def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
-    """Compare the pose of two LiDARs with that by a sensor calibrated to both.
+    """Compare the pose of two LiDARs with that via a sensor calibrated to both.
 
     All three results have seen the same boards: their errors are counted as independent.
     """

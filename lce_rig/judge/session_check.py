@@ -47,7 +47,7 @@ class Meeting:
 
     @property
     def way_m(self) -> float:
-        """Distance that the board's middle moved between scan and image."""
+        """Distance that the board's centre moved between scan and image."""
         before, after = self.measured.surface.T_lidar_board, self.lidar_at_image_time.T_lidar_board
         return float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
@@ -83,7 +83,7 @@ def bring_together(
     own = list(timed[channel])
     if not own:
         return {}
-    # A capture's own image counts, if several hold the same scan.
+    # If several captures hold the same scan, use the capture's own image.
     scans = [SharedScan((o.capture,), {**by_scan[scan_key(o)], channel: o.image}, o.lidar) for o in own]
     samples = sample_poses(scans, clocks, {name: of_channel[name].noise_px for name in timed})
     offset_s = np.array([of_channel[name].time_offset_s for name in samples.channels], dtype=np.float64)
@@ -116,7 +116,7 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
 
     Args:
         candidates: detections of both sensors.
-        board: its size weighs angles against distances.
+        board: the board's size weighs angles against distances.
         T_cam_lidar: (4, 4).
     """
     poses = [candidates.pose.T_cam_board]
@@ -146,7 +146,7 @@ class SessionCheck:
         pair: the sensors.
         calibration: the calibration to check.
         findings: why these captures contradict it; empty if they agree.
-        residuals: of each capture in which both sensors see the board.
+        residuals: residuals of each capture in which both sensors see the board.
         metrics: their summary; None without any.
         scene: the opinion of the scene's edges on the extrinsics.
         meetings: by capture, the boards of the residuals.
@@ -163,7 +163,7 @@ class SessionCheck:
     page: Path | None = None
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         names = ("plane_mean_m", "plane_rms_m", "edge_mean_m", "edge_rms_m", "reprojection_px")
         used = self.calibration.captures_used
         return {
@@ -194,7 +194,7 @@ class SessionCheck:
 
 
 def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
-    """Replace figures that are not known by null, for JSON."""
+    """Replace unknown figures by null, for JSON."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
@@ -211,9 +211,9 @@ def check_session(
 
     Args:
         rig: the session's.
-        detections: of the session.
+        detections: detections of the session.
         calibration: the extrinsics; they may come from another session of the same rig.
-        channel: of the calibration's channels.
+        channel: one of the calibration's channels.
         scene: the opinion of this session's scene.
     """
     pair = replace(Pair.of(calibration), channel=channel)
@@ -271,8 +271,8 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
     """Find contradictions of captures and extrinsics: large residuals, or no board at the expected place.
 
     Args:
-        metrics: of the captures in which both sensors agree on the board's place; None without any.
-        rig: its limits.
+        metrics: metrics of the captures in which both sensors agree on the board's place; None without any.
+        rig: the profile with the limits.
         n_elsewhere: captures without a surface in the scan near the camera's detection. One such capture may
             be a board that the LiDAR missed among objects of its size; many are a contradiction.
         n_seen: captures with detections of both sensors.
@@ -296,10 +296,10 @@ def find_meetings(
 
     Args:
         rig: the profile.
-        detections: of the captures.
+        detections: detections of the captures.
         pair: the sensors.
         T_cam_lidar: (4, 4) the extrinsics.
-        results: of the channels of the calibration.
+        results: results of the channels of the calibration.
 
     Returns:
         By name of the capture.

@@ -47,10 +47,10 @@ from lce_rig.judge.scene_drift import SceneChange
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
-# Largest standard deviation of a measured side of the plate, m, and the error that fails: 5 % exceeds the
-# beam's spot.
+# Largest standard deviation of a measured side of the plate, m, and the relative error that fails: 5 %
+# exceeds the beam's width.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
-# Rings do not cross the ends of a side that is as upright as this.
+# Direction of a side, nearly vertical, whose ends rings do not cross.
 _UPRIGHT = 0.87
 # Fractions of scans without one of two edges, and of ring ends off the outline, which together show a wrong
 # size. Of 15 sessions with the right size one lacks edges, by its mounting, and drops none; one drops as
@@ -117,7 +117,7 @@ def judge(
 
 
 def _explained(findings: Sequence[Finding], examination: Validation) -> list[Finding]:
-    """Make the first cause a reason if it explains the captures and there are only symptoms besides."""
+    """Make the first cause a reason if it explains the captures and all others are symptoms."""
     if not (examination.is_explained and is_symptom_alone(findings)):
         return list(findings)
     return [replace(f, severity="warning") if f is examination.causes[0] else f for f in findings]
@@ -160,11 +160,11 @@ def with_findings(calibration: Calibration, found: Sequence[Finding]) -> Calibra
 
 
 def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration:
-    """Add the scene's opinion to judged extrinsics; only a contradiction changes the verdict.
+    """Add the result of the scene check to judged extrinsics; only a contradiction changes the verdict.
 
     Args:
         calibration: judged by its boards.
-        opinion: of the scene without the board.
+        opinion: the check on the scene without the board.
     """
     return with_findings(replace(calibration, scene=opinion), scene_findings(opinion, calibration))
 
@@ -173,7 +173,7 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
     """List the scene's contradiction of extrinsics, if there is one, with the likely cause as its action.
 
     Args:
-        opinion: of the scene.
+        opinion: the check on the scene.
         calibration: the extrinsics.
         action: if known already.
     """
@@ -237,7 +237,7 @@ def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]
 
 def _motion(estimate: CalibrationEstimate) -> list[Finding]:
     rms_m = estimate.diagnostics.fit_plane_rms_m
-    if not rms_m > MAX_PLANE_MISFIT_M:  # NaN where the method has no such residual
+    if not rms_m > MAX_PLANE_MISFIT_M:  # NaN if the method has no such residual
         return []
     is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
     return [PLANES_APART(action="compensated" if is_compensated else "", rms_m=rms_m)]
@@ -325,7 +325,7 @@ def nominal_findings(T: Array, nominal: NominalExtrinsic | None) -> list[Finding
 
 
 def plate_findings(scans: Iterable[BoardSurface | Refusal], board: Board) -> list[Finding]:
-    """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot.
+    """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's width.
 
     If the profile's plate is larger than the true one by more than the search range for edges, one of two
     opposite edges has no ring ends, and those of the true edge are dropped.
@@ -333,7 +333,7 @@ def plate_findings(scans: Iterable[BoardSurface | Refusal], board: Board) -> lis
     Args:
         scans: boards, of which those in scans count, and refusals: a plate refused for its size counts as
             measured.
-        board: of the profile.
+        board: board of the profile.
     """
     sizes: dict[str, list[tuple[float, float]]] = {"width": [], "height": []}
     dropped, n_lacking = [], {"width": 0, "height": 0}
@@ -382,12 +382,12 @@ def distance_findings(
 
     Args:
         in_camera, in_lidar: (N, 3) centres of the boards of N captures, m.
-        square_m: of the profile.
+        square_m: square size of the profile.
         n_misfits: images whose corners fit no pose of the board. Wrong squares cause none, a wrong lens does.
     """
     first, second = np.triu_indices(len(in_camera), 1)
     camera_m, lidar_m = (np.linalg.norm(c[first] - c[second], axis=1) for c in (in_camera, in_lidar))
-    is_far = (camera_m > 0.5) & (lidar_m > 0.5)  # m; noise changes their ratio little
+    is_far = (camera_m > 0.5) & (lidar_m > 0.5)  # m; noise hardly changes their ratio
     if np.count_nonzero(is_far) < 3:
         return []
     ratios = np.log(camera_m[is_far] / lidar_m[is_far])

@@ -45,7 +45,7 @@ _SCATTER_ROUNDS = 3
 _BAD = 4.0
 # Directions of the intrinsics with a smaller share of the largest variance are the prior's.
 _DETERMINED = 1e-3
-# A capture that alone decides a direction has no others to be compared with.
+# A single capture that determines a direction cannot be compared with others.
 _LEAST_REST = 1e-3
 # A focal length with a larger relative standard deviation is undetermined.
 _MAX_FOCAL_SIGMA = 0.1
@@ -68,10 +68,10 @@ def estimate_intrinsics(
     prior counts.
 
     Args:
-        views: of at least `MIN_CAPTURES` captures.
+        views: views of at least `MIN_CAPTURES` captures.
         board: the board.
         start: an initial guess at the images' resolution; it may be wrong by a third.
-        model: of the lens to fit.
+        model: model of the lens to fit.
         prior: the profile's intrinsics; None to use the boards alone.
         n_folds: number of cross-validation folds; 0 for none.
 
@@ -94,7 +94,7 @@ def estimate_intrinsics(
             solved = solve_planar_pose(setup.corners_px[k], setup.corners_board, lens)
             starts[k] = starts[k] if solved is None else solved.T_cam_board
         state = refit_poses(setup, fitted.with_poses(starts))
-        # Boards that fit about as well as is typical of their channel.
+        # Keep boards that fit about as well as is typical of their channel.
         variances = _variances(setup, state)
         fits = variances <= _BAD**2 * (_usual(variances, channels) + _SHARED_PX**2)
         if rounds_left == 0 or np.array_equal(fits, kept):
@@ -112,7 +112,7 @@ def estimate_intrinsics(
 
 
 def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: Board) -> Array:
-    """Measure how well given intrinsics fit, with only poses and the board's shape free.
+    """Measure how well given intrinsics fit, estimating only poses and the board's shape.
 
     Returns:
         Rms distance (K,) of each view's corners from their prediction, px.
@@ -157,7 +157,7 @@ def _variances(setup: Setup, state: LensState) -> Array:
 
 
 def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
-    """Return for each board the median of its channel (K,)."""
+    """Return the median variance (K,) of all boards on the channel of each board."""
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 

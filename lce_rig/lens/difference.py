@@ -22,7 +22,7 @@ _LEAST_ALIGNED = 10
 
 
 class LensDifference(NamedTuple):
-    """Distance between the pixels of two lens models for the same rays, at places with boards.
+    """Pixel distance between two lens models for the same rays, at board positions.
 
     Attributes:
         rms_px: rms distance; infinite if the first model projects none of the pixels.
@@ -52,7 +52,7 @@ class LensCertainty:
 
     @property
     def covered(self) -> float:
-        """Share of the image in which boards were seen."""
+        """Fraction of the image in which boards were detected."""
         return float(self.is_covered.mean())
 
     @property
@@ -73,7 +73,7 @@ def compare_lenses(
         first, second: for images of the same size.
         corners_px: (n, 2) where boards were seen.
         cov: (P, P) of the second's parameters.
-        model: of the second, whose parameters these are.
+        model: model of the second, whose parameters these are.
 
     References:
         D. Kogan, mrcal: projection difference and implied transformation.
@@ -99,19 +99,19 @@ def compare_lenses(
 
 
 def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> Array:
-    """Propagate the covariance of intrinsics to the errors that a profile states.
+    """Convert the covariance of intrinsics to the four errors that a profile states.
 
-    Parameters are correlated: the errors are fitted to the pixel displacements at places with boards.
+    As the parameters are correlated, the four errors are fitted to the pixel displacements at the corners.
 
     Args:
         fitted: the intrinsics.
-        corners_px: (n, 2) where boards were seen.
-        cov: (P, P) of their parameters.
-        model: whose parameters these are.
+        corners_px: (n, 2) detected board corners.
+        cov: (P, P) covariance of the parameters of the intrinsics.
+        model: the lens model with these parameters.
 
     Returns:
-        (4, 4) of the relative error of both focal lengths, of the principal point's x and y, px, and of the
-        pixels by which the distortion's cubic term displaces the image's corner outwards.
+        Covariance (4, 4) of the relative error of the focal length, of the principal point's x and y, px, and
+        of the outward displacement of the image's corner by the cubic distortion term, px.
     """
     vector, rays = model.vector(fitted), fitted.unproject(corners_px)
     _, _, by_lens = model.project(vector, rays[np.isfinite(rays).all(axis=1)])
@@ -125,7 +125,7 @@ def profile_errors(fitted: Intrinsics, corners_px: Array, cov: Array, model: Len
 
 
 def turn_of_lens(intrinsics: Intrinsics) -> Array:
-    """Find the rotation of the camera (3, P) that projects like a change of each parameter of its lens."""
+    """Find the camera rotation (3, P) with the same effect on pixels as a change of each lens parameter."""
     model, rays = model_of(intrinsics), intrinsics.unproject(_grid(intrinsics).reshape(-1, 2))
     turn, _ = _best_turn(model, model.vector(intrinsics), rays[np.isfinite(rays).all(axis=1)])
     return -turn

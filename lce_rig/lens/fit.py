@@ -1,4 +1,4 @@
-"""Intrinsics from the corners of many boards: least squares over the lens, the board's shape and every pose.
+"""Intrinsics from the corners of many boards: least squares over lens, board shape and all poses.
 
 Lens and board are shared by all images, the pose is each one's own: the normal equations have an arrow's
 shape, and eliminating the poses (Schur) leaves one small system however many images there are.
@@ -28,7 +28,7 @@ BOW_SIGMA_M = 0.003
 BEND_SIGMA_M = 0.001
 ASPECT_SIGMA = 0.002
 PRINT_SIGMA_M = 1e-4
-# A board that the profile states to be exact.
+# A board stated as exact in the profile.
 _EXACT_M = 1e-7
 # Bow along width and height, aspect, five further bends, seven smooth displacements of the pattern; then the
 # corners' own offsets.
@@ -49,7 +49,7 @@ class Setup:
         shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
         mean: (P + S,) lens and shape a priori.
         information: (P + S, P + S) of it.
-        model: of the lens.
+        model: model of the lens.
         is_lens_free: whether the intrinsics are fitted; else only the board's shape and the poses are.
     """
 
@@ -70,8 +70,8 @@ class Setup:
         Args:
             corners_px: as measured.
             board: the board.
-            model: of the lens.
-            prior: of lens and board; None without one of the lens.
+            model: model of the lens.
+            prior: prior information of lens and board; None without one of the lens.
 
         References:
             D. Kogan, mrcal: the deformed calibration object.
@@ -148,16 +148,18 @@ class Setup:
 
 
 def board_shapes(board: Board) -> tuple[Array, Array]:
-    """List smooth deviations of a board from its nominal shape.
+    """Return the 15 basis functions of a board's deviation from its nominal shape.
 
-    Bends are heights of the plate towards the viewer, with zero mean and slope over the plate, so that the
-    board's frame stays in its middle: with u and v from -1 to 1 along width and height of the plate, 1/3 -
-    u^2 and 1/3 - v^2 (a bow by the height of the middle over the ends), u v (twist), and four of third order.
-    The pattern's aspect is the fraction by which it is longer along its width than along its height; second
-    order displaces it in x and y, and shears it.
+    With u and v from -1 to 1 along the plate's width and height, there are
+
+    - 7 bends, heights towards the viewer: two bows 1/3 - u^2 and 1/3 - v^2 (unit: height of the middle over
+      the ends), the twist u v, and four of third order. Mean and slope over the plate are zero, so that the
+      board's frame stays in its middle;
+    - the pattern's aspect: the fraction by which its width is stretched relative to its height;
+    - 6 displacements of the pattern in x and in y, of second order, and its shear.
 
     Returns:
-        (15, N, 3) displacement of the corners per unit, and (15,) standard deviations a priori.
+        (15, N, 3) displacement of the corners per unit, and (15,) prior standard deviations.
     """
     corners = board.corners()
     u, v = 2 * corners[:, 0] / board.width_m, 2 * corners[:, 1] / board.height_m
@@ -179,7 +181,7 @@ def board_shapes(board: Board) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class LensState:
-    """Values of every unknown.
+    """Values of all unknowns.
 
     Attributes:
         lens: (P,) parameters of the lens model.
@@ -206,7 +208,7 @@ class LensState:
 
 
 def corners_of(setup: Setup, shape: Array) -> Array:
-    """Place the board's corners (N, 3) according to its shape (S,), frame board, m."""
+    """Return the board's corners (N, 3) deformed by its shape (S,), frame board, m."""
     return np.asarray(setup.corners_board + np.tensordot(shape, setup.shapes, axes=1))
 
 
@@ -261,7 +263,7 @@ def refit_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) ->
 
 
 def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) -> tuple[Array, Array, Array]:
-    """Fit poses of boards (K, N, 2) to an estimated lens and board, each alone.
+    """Fit poses of boards (K, N, 2) to an estimated lens and board, each separately.
 
     Returns:
         T_cam_board (K, 4, 4), costs (K,) px^2 and information (K, 6, 6) for corners of 1 px.
@@ -274,13 +276,13 @@ def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) ->
 
 
 def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Array, errors: Array) -> Array:
-    """Compute how far fitted poses move with lens and board.
+    """Compute how fitted poses change with lens and board.
 
     Args:
-        estimate: of both.
-        corners_px: (K, N, 2) of boards.
-        T_cam_board: (K, 4, 4) of these.
-        errors: (n, P + 15) added to lens and shape.
+        estimate: estimate of both.
+        corners_px: (K, N, 2) corners of K boards.
+        T_cam_board: (K, 4, 4) poses of these boards.
+        errors: (n, P + 15) errors added to lens and shape.
 
     Returns:
         (n, K, 6) tangents -(sum J^T J)^-1 sum J^T G error, with J and G the derivatives of the corners.
@@ -292,7 +294,7 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
 
 
 def fit_readout(estimate: IntrinsicsEstimate) -> tuple[Array, Array]:
-    """Fit to each view of an estimate that its rows were read out one after another while the board moved.
+    """Fit a rolling shutter, rows exposed in turn while the board moved, to each view of an estimate.
 
     Corners are displaced by the board's motion since the middle row, in proportion to their row. Most of that
     a pose takes up; the rest shears the board, as no pose does.
@@ -405,7 +407,7 @@ def _step(
 
 
 def solve_scaled(H: Array, right: Array) -> Array:
-    """Solve H x = right for unknowns of very different units."""
+    """Solve H x = right for unknowns of very different units, by scaling."""
     scale = 1.0 / np.sqrt(np.diag(H))
     scaled = H * np.outer(scale, scale)
     return np.asarray((np.linalg.solve(scaled, (right.T * scale).T).T * scale).T)

@@ -29,8 +29,8 @@ class BoardView:
 
     Attributes:
         capture: the image's capture; views of one capture are held out together.
-        channel: of the camera; each has its own noise level.
-        board: its corners, and a pose to start from.
+        channel: channel of the camera; each has its own noise level.
+        board: the board's corners, and a pose to start from.
     """
 
     capture: str
@@ -48,7 +48,7 @@ class IntrinsicsEstimate:
     """Intrinsics fitted to views, with the figures to judge them.
 
     Attributes:
-        model: of the lens.
+        model: model of the lens.
         intrinsics: the estimate.
         cov: (P, P) of `model.parameters`, from the captures' scatter.
         cov_with_board: (P + 15, P + 15) of these and of `shape`.
@@ -123,8 +123,8 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
     """List the weaknesses of the captures, with figures and actions, the most severe first.
 
     Args:
-        estimate: of the lens.
-        certainty: of the same.
+        estimate: estimate of the lens.
+        certainty: uncertainty of these intrinsics.
     """
     texts, n = [], len({view.capture for view in estimate.views})
     if n < ENOUGH_CAPTURES:
@@ -172,7 +172,7 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
 
 
 def reach(estimate: IntrinsicsEstimate) -> float:
-    """Measure how far boards reach from the principal point to the image's farthest corner, 0..1."""
+    """Return how far boards reach from the principal point to the image's farthest corner, 0..1."""
     i = estimate.intrinsics
     centre = np.array([i.cx_px, i.cy_px])
     ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])

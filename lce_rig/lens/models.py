@@ -20,7 +20,7 @@ _HOLDS = 1e4
 
 @dataclass(frozen=True)
 class LensModel:
-    """A lens model: [fx, fy, cx, cy, distortion ...] in pixels and the order of `Intrinsics.distortion`.
+    """A lens model: [fx, fy, cx, cy, distortion ...], in pixels, ordered as `Intrinsics.distortion`.
 
     Attributes:
         name: its name on the command line.
@@ -113,7 +113,7 @@ def model_of(intrinsics: Intrinsics) -> LensModel:
 
 
 def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
-    """Find the parameters (P,) of another model with about the same projection.
+    """Find the parameters (P,) of another model with nearly the same projection.
 
     Exact where the new model contains the old one; else least squares over a grid of pixels, within the field
     of view where the old model is valid. There the new one must not fold back: a free fit can do so next to
@@ -157,19 +157,19 @@ _OF_CORNER = 0.4
 # Share of the whole distortion by which decentring displaces a pixel in the corner. Boards hardly separate it
 # from a shift of the principal point; its coefficients p1, p2 are the tangential ones of the radtan models.
 _DECENTRING = 0.4
-# Intrinsics that a profile states to be exact.
+# Standard deviations of intrinsics stated as exact.
 _EXACT, _EXACT_PX = 1e-7, 1e-4
 
 
 @dataclass(frozen=True)
 class LensPrior:
-    """A profile's intrinsics, and how exact they are.
+    """A profile's intrinsics and their standard deviations.
 
     Attributes:
         lens: the intrinsics.
         focal_length: standard deviation of both focal lengths alike, relative.
-        principal_point_px: of each coordinate.
-        distortion_px: of a pixel's displacement in the image's corner.
+        principal_point_px: standard deviation of each coordinate.
+        distortion_px: standard deviation of a pixel's displacement in the image's corner.
         is_board_exact: whether the board has its nominal shape.
     """
 
@@ -197,7 +197,7 @@ class LensPrior:
 
     @property
     def is_exact(self) -> bool:
-        """Whether neither lens nor board has an error."""
+        """Whether the profile states lens and board as exact."""
         return self.is_board_exact and not any(
             (self.focal_length, self.principal_point_px, self.distortion_px)
         )
@@ -234,7 +234,7 @@ class LensPrior:
 
 
 def grid_rays(lens: Intrinsics) -> tuple[Array, Array]:
-    """List pixels (n, 2) of a grid over the image and their rays (n, 3), where the lens has one.
+    """List pixels (n, 2) of a grid over the image and their rays (n, 3), where the model is valid.
 
     A pinhole polynomial cannot project points beside or behind the camera.
     """

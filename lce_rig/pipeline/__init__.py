@@ -1,4 +1,4 @@
-"""The verbs for one rig: captures -> detections -> extrinsics -> files and images. Start reading here.
+"""The commands for one rig: captures -> detections -> extrinsics -> files and images. Start reading here.
 
     detections = detect(session)                 detect_session.py: the board in all images, scans and events
     result = calibrate(session, detections)      calibration.py: extrinsics and a verdict for each pair

@@ -85,8 +85,8 @@ class _Solved:
         pairs: channels of the camera with the LiDAR.
         settings: the user's options, with the LiDAR's properties from the profile.
         refused: why captures without the board in both sensors are unusable.
-        estimate: of the extrinsics.
-        validation: of the estimate on the camera's own captures and images.
+        estimate: estimate of the extrinsics.
+        validation: validation of the estimate on the camera's own captures and images.
         lacking: why channels of the camera are not part of it.
         together: the joint estimate that includes it; None if it was estimated separately.
     """
@@ -114,7 +114,7 @@ class _Solved:
 
     @property
     def costs(self) -> PairCosts:
-        """Costs of the captures, by which a motion of either sensor shows."""
+        """Costs of the captures, which reveal a motion of either sensor."""
         return PairCosts.of((self.camera, self.lidar), self.estimate, self.validation)
 
     def evidence(self, detections: Detections) -> CameraEvidence:
@@ -131,7 +131,7 @@ class _Solved:
 
 
 class _Link(NamedTuple):
-    """Two cameras of one LiDAR.
+    """Two cameras that share a LiDAR.
 
     Attributes:
         members: their indices among those with an estimate.
@@ -167,7 +167,7 @@ def calibrate_session(
     Args:
         session: its folder, or one that is open for reading.
         detections: of the session; None detects the board first, as `detect_boards` does by default.
-        options: of the estimate; None for the defaults.
+        options: options of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
@@ -223,8 +223,8 @@ def calibrate_detections(
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
-        detections: of one session.
-        options, cameras, channels, progress: as of `calibrate_session`.
+        detections: detections of one session.
+        options, cameras, channels, progress: as in `calibrate_session`.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.
@@ -302,7 +302,7 @@ def calibrate_detections(
 
 
 def _without_disagreeing(shortages: Sequence[Finding]) -> list[Finding]:
-    """Name a sensor whose captures agree with those of no other one, in place of its pairs."""
+    """Report a sensor whose captures agree with no other one, instead of its pairs."""
     sensors = [each.figures.get("sensors") for each in shortages if each.code == FEW_AGREE.code]
     pairs = [{str(name) for name in pair} for pair in sensors if isinstance(pair, tuple)]
     counts = Counter(name for pair in pairs for name in pair)
@@ -316,7 +316,7 @@ def _without_disagreeing(shortages: Sequence[Finding]) -> list[Finding]:
 
 
 def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:
-    """List LiDARs in no capture, and groups of sensors that no placement connects with the first one's.
+    """List LiDARs without captures, and groups of sensors not connected with the first one's by placements.
 
     The placement that would connect them is one before the two sensors that share the most captures already.
     """
@@ -366,7 +366,7 @@ def _pairs_by_sensors(
 def _shared_lenses(
     rig: Rig, detections: Detections, groups: Sequence[Sequence[Pair]]
 ) -> dict[str, SessionLens]:
-    """Fit the lens of each camera with several LiDARs once: extrinsics with other lenses differ by a turn."""
+    """Fit the lens of each camera with several LiDARs once: with different lenses, extrinsics are rotated."""
     n_lidars = Counter(pairs[0].camera for pairs in groups)
     seen: dict[str, dict[str, dict[str, ImageBoard]]] = {}
     for pair in (pair for pairs in groups for pair in pairs if n_lidars[pair.camera] > 1):
@@ -378,7 +378,7 @@ def _shared_lenses(
     for camera, by_channel in seen.items():
         prior = Tolerances.of(rig.cameras[camera], rig.board).lens
         images = {name: [by[c] for c in sorted(by)] for name, by in by_channel.items()}
-        # A pair that is estimated reports why its lens cannot be fitted.
+        # A pair reports why its lens cannot be fitted once it is estimated.
         with suppress(NotEnoughDataError):
             if not prior.is_exact:
                 lenses[camera] = fit_session_lens(images, rig.board.to_board(), prior)
@@ -445,7 +445,7 @@ def _examine(
 
 
 def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> list[_Link]:
-    """Compare the cameras of each LiDAR by the still boards that both saw, and by each other's names."""
+    """Compare the cameras of each LiDAR by their common still boards, and test for exchanged names."""
     links = []
     for members in combinations(range(len(solved)), 2):
         one, other = (solved[k] for k in members)
@@ -465,7 +465,7 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
 def _open_loops(
     rig: Rig, alone: Sequence[_Solved], between: Sequence[SolvedPeers]
 ) -> list[tuple[Loop, Finding]]:
-    """List loops of three sensors whose poses, each pair's alone, contradict each other.
+    """List loops of three sensors whose separately estimated poses contradict each other.
 
     Loops with a pair whose own captures contradict each other are open for that reason, and are left out.
     """
@@ -493,7 +493,7 @@ def _solve_together(
     loops: Sequence[tuple[Loop, Finding]],
     excluded: Set[SensorPair],
 ) -> tuple[list[_Solved], list[SolvedPeers]]:
-    """Estimate sensors that agree as one; leave the others unchanged.
+    """Estimate sensors that agree jointly; leave the others unchanged.
 
     A sensor that contradicts another, or its own captures, is excluded, as it would corrupt the others'
     extrinsics. So are the pairs given as such, and method "paper", which gives Algorithm 1's solution.
@@ -534,18 +534,18 @@ def _solve_together(
 
 
 def _suspects(solved: Sequence[_Solved], link: _Link) -> tuple[int, ...]:
-    """Choose the cameras that a contradiction of two concerns: one whose own captures contradict, or both."""
+    """Choose the cameras affected by a contradiction of two: one with contradicting captures, or both."""
     unsound = tuple(k for k in link.members if not _is_sound(solved[k].validation))
     return unsound or link.members
 
 
 def _is_sound(validation: Validation) -> bool:
-    """Return whether no contradiction between captures fails the result."""
+    """Check that no contradiction between captures fails the result."""
     return all(cause.severity != "error" for cause in validation.causes)
 
 
 def _connected(pairs: Iterable[SensorPair]) -> list[list[SensorPair]]:
-    """Group pairs that sensors connect, sorted."""
+    """Group pairs connected by common sensors, sorted."""
     groups: list[tuple[set[str], list[SensorPair]]] = []
     for pair in sorted(pairs):
         touched = [group for group in groups if group[0] & set(pair)]
@@ -605,7 +605,7 @@ def _judged(
         n_captures=n_captures,
         n_detected=n_captures - len(own.refused),
         captures_used=tuple(sorted(used)),
-        # A capture counts as used where another channel of the same scan is.
+        # A capture counts as used if another channel with the same scan is used.
         captures_refused={name: refused[name] for name in sorted(refused) if name not in used},
         verdict=verdict,
         findings=findings,

@@ -58,12 +58,12 @@ class MeasuredIntrinsics:
     """A camera's intrinsics from the boards of a session, compared with the profile's.
 
     Attributes:
-        camera: its name.
+        camera: the camera's name.
         channels: the channels whose images were used.
         given: the profile's intrinsics.
         estimate: the intrinsics from the boards.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
-        certainty: of the estimate, per pixel.
+        certainty: uncertainty of the estimate, per pixel.
         judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
             another lens model that fits them.
         misfit: how the profile's do not fit; None if they do, or are for another resolution.
@@ -84,7 +84,7 @@ class MeasuredIntrinsics:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The estimate, rounded as in every file."""
+        """The estimate, rounded as in the written files."""
         lens = self.estimate.intrinsics
         pixels = {key: round(getattr(lens, key), 4) for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
         return replace(lens, **pixels, distortion=tuple(round(value, 8) for value in lens.distortion))
@@ -116,7 +116,7 @@ def measure_intrinsics(
 
     Args:
         session: open for reading is enough.
-        camera: its name.
+        camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
         model: name of a lens model; the profile's if None.
@@ -265,7 +265,7 @@ def _fit(
     ]
     board = rig.board.to_board()
     lens_model = model_of(start) if model is None else MODELS[model]
-    # As `calibrate` weighs them; the profile's have no part in another model or resolution.
+    # Same weights as in `calibrate`; the profile is not used for another model or resolution.
     prior = LensPrior.read(rig.cameras[camera], rig.board)
     sizes = [(lens.width_px, lens.height_px) for lens in (start, prior.lens)]
     is_comparable = sizes[0] == sizes[1] and lens_model == model_of(prior.lens)
@@ -273,7 +273,7 @@ def _fit(
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ in one step: a camera_info file for each camera.
+    """Write the session's intrinsics/ in one step: one camera_info file per camera.
 
     Other files there stay, as those of cameras that an earlier run measured.
 
@@ -299,21 +299,21 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 def save_profile(
     session: Session, measured: Sequence[MeasuredIntrinsics], path: Path, *, is_forced: bool = False
 ) -> tuple[str, ...]:
-    """Write the session's profile with the intrinsics that the session determines better, and its comments.
+    """Write a copy of the session's profile with the improved intrinsics; comments are kept.
 
     Args:
-        session: whose profile.
-        measured: intrinsics from its boards.
-        path: of the new profile.
-        is_forced: write all of them.
+        session: the session with the original profile.
+        measured: intrinsics estimated from its boards.
+        path: the file to write.
+        is_forced: whether to write all intrinsics, not only the significantly better ones.
 
     Returns:
         The cameras whose intrinsics were replaced.
 
     Raises:
         UsageError: the file exists already.
-        ResultRefusedError: the session determines none better than its profile; nothing is written.
-        ProfileError: the intrinsics make no valid profile.
+        ResultRefusedError: no intrinsics are better than the profile's; nothing is written.
+        ProfileError: the profile with these intrinsics is not valid.
     """
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]
@@ -357,7 +357,7 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
 
 
 def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
-    """List the figures as plain types; those that could not be computed are null."""
+    """List the figures as plain types; unknown ones are null."""
     return {
         "rig": rig.name,
         "made_by": MADE_BY,

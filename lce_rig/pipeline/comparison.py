@@ -21,10 +21,10 @@ from lce_rig.session.identity import differing_keys
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """Sessions of one rig, or results of one session, compared.
+    """Sessions of one rig, or results of one session, and their comparison.
 
     Attributes:
-        rig: its name.
+        rig: the rig's name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
         findings: errors name sessions whose own calibration has failed; warnings state limits.
     """
@@ -40,11 +40,11 @@ class Repeat:
 
 
 def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
-    """Compare the results that one session holds, such as those of frames and of events.
+    """Compare the results in one session, such as those of frames and of events.
 
     Args:
-        folder: of the session.
-        names: of the results; all but the previous one where empty.
+        folder: folder of the session.
+        names: names of the results; if empty, all but the previous one.
 
     Raises:
         UsageError: fewer than two results; or a name is given twice, or cannot be one.
@@ -76,8 +76,8 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
     Args:
-        folders: of the sessions.
-        name: of the result to take from each; None for the one in calibration/.
+        folders: folders of the sessions.
+        name: name of the result to take from each; None for the one in calibration/.
 
     Raises:
         UsageError: fewer than two sessions, or one given twice.
@@ -137,7 +137,7 @@ def _require_same(sessions: Mapping[str, Session]) -> None:
 
 
 def _require_independent(sessions: Mapping[str, Session]) -> None:
-    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
+    """Refuse sessions that share images or scans: a copy always agrees with its original."""
     hashes: dict[str, set[str]] = {name: set() for name in sessions}
     for name, session in sessions.items():
         for capture in session.captures:

@@ -102,20 +102,20 @@ def detect_boards(
 
 
 def unlike_models(session: Session, detections: Detections) -> list[Finding]:
-    """Compare the first scan of each LiDAR with the beams of its model, as `collect` does.
+    """Compare the first scan of each LiDAR with its model's beams, as in `collect`.
 
     Boards are also found in scans with skipped points, at wrong places. Refusals that name these suffice.
 
     Args:
         session: open for reading is enough.
-        detections: of the session.
+        detections: detections of the session.
     """
     found: list[Finding] = []
     for lidar, by_capture in detections.lidars.items():
         codes = {each.code for each in by_capture.values() if isinstance(each, Refusal)}
         if LIDAR_RINGS_SKIPPED.code in codes or not by_capture:
             continue
-        with suppress(SessionError):  # The detection names a damaged one.
+        with suppress(SessionError):  # The detection reports damaged scans.
             scan = session.capture(min(by_capture)).scan(lidar)
             found += compare_beams(scan, session.rig.lidars[lidar])
     return found
@@ -190,7 +190,7 @@ class _Finder:
             found = self._boards.scan(scan)
             if not isinstance(found, Refusal) or found.stage != "lidar":
                 return found
-            # Skipped points hide the board wherever it is held.
+            # Skipped points hide the board at any placement.
             seen = compare_beams(scan, self._session.rig.lidars[lidar])
             skipped = next((each for each in seen if each.code == RINGS_SKIPPED.code), None)
             return found if skipped is None else LIDAR_RINGS_SKIPPED.refusal(lidar, **skipped.figures)
@@ -198,7 +198,7 @@ class _Finder:
         return self._remembered(self._digest, capture, lidar, find)
 
     def look(self, capture: Capture, lidar: str, poses: Sequence[Array]) -> LidarDetection:
-        """Find the board in a scan about one of the predicted poses T_lidar_board (4, 4)."""
+        """Find the board in a scan near one of the predicted poses T_lidar_board (4, 4)."""
 
         def find() -> LidarDetection:
             found = self._boards.look_in_scan(capture.scan(lidar), poses).usable
@@ -233,7 +233,7 @@ class _Finder:
     def _see(
         self, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
     ) -> tuple[Image | Refusal, ImageDetection]:
-        """Reconstruct an image of a capture's events for the LiDAR's time of the board, and find it there."""
+        """Reconstruct an image of a capture's events at the scan's time of the board, and find the board."""
         from lce_rig.detect.events.figures import sweep_time_s
 
         rig, events = self._session.rig, capture.events(camera)
@@ -255,7 +255,7 @@ class _Finder:
     def _remembered(
         self, digest: str, capture: Capture, sensor: str, find: Callable[[], _Found]
     ) -> _Found | Refusal:
-        """Read a detection from the session's cache, or make and store it; a damaged sample is a refusal."""
+        """Read a detection from the session's cache, or compute and store it; damage gives a refusal."""
         try:
             check_capture(self._session.rig, capture)
             capture.check()
@@ -275,7 +275,7 @@ class _Finder:
 
 
 def _frame_speed_mps(capture: Capture, camera: str) -> float:
-    """Read the board's speed in a camera's frames, as `collect` measured it; NaN if unknown."""
+    """Return the board's speed in a camera's frames channel, as measured by `collect`; NaN if unknown."""
     has_frames = any(sensor == camera for sensor, _ in capture.image_keys)
     speed_mps = capture.meta.get("speed_mps")
     return float(speed_mps) if has_frames and isinstance(speed_mps, float) else math.nan
@@ -318,7 +318,7 @@ def event_channels(rig: Rig, capture: Capture) -> list[tuple[str, str]]:
 def picture_stamp_ns(
     rig: Rig, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
 ) -> int | None:
-    """Return when a LiDAR saw the board, on the channel's clock; None if no scan has a timestamp.
+    """Return the time at which a LiDAR saw the board, on the channel's clock; None without timestamps.
 
     Of several LiDARs, the first in the profile that found the board counts. If none did, or points have no
     times, the time is the middle of the scan.
@@ -341,7 +341,7 @@ def picture_stamp_ns(
 def boards_in(
     detections: Detections, camera: str, lidar: str, captures: Collection[str] | None = None
 ) -> Array:
-    """Stack the board's poses T_cam_board (N, 4, 4) in captures that both sensors see; in all if None."""
+    """Stack the board's poses T_cam_board (N, 4, 4) in captures with the board in both sensors; None: all."""
     poses: dict[str, Array] = {}
     for pair in detections.pairs:
         if (pair.camera, pair.lidar) == (camera, lidar):
@@ -374,7 +374,7 @@ def match_sensors(
 
 
 def association_errors(rig: Rig, detections: Detections, pair: Pair) -> list[Finding]:
-    """List the error, if any, by which images and scans of a pair do not belong together."""
+    """List the association error of a pair's images and scans, if there is one."""
     candidates, _ = detections.candidates(pair, rig.board.to_board())
     consensus = _consensus(rig, candidates)
     error = find_association_error(candidates, rig.board.to_board(), consensus)
@@ -389,7 +389,7 @@ def _consensus(rig: Rig, candidates: Sequence[Observation]) -> Consensus | None:
 
 
 def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str, list[Array]]]:
-    """Predict where the board is in scans that show it nowhere, or elsewhere than the images.
+    """Predict the board's position in scans without it, or with it elsewhere than in the images.
 
     Returns:
         By LiDAR and capture the poses T_lidar_board (4, 4) that the image leaves open.

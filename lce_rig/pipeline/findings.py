@@ -1,4 +1,4 @@
-"""Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
+"""Kinds of findings of the commands: sensors without a result, and results that cannot be compared."""
 
 from collections.abc import Collection, Mapping
 
@@ -13,7 +13,7 @@ def _commonest(finding: Finding) -> str:
     causes = finding.figures["causes"]
     assert isinstance(causes, tuple)
     lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
-    # Where most captures are refused, their causes come first.
+    # If most captures are refused, list their causes first.
     if 2 * finding.figure("n_detected") >= finding.figure("n_captures"):
         where = finding.figures.get("where")
         n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
@@ -75,11 +75,11 @@ CHANNEL_REJECTED = warning_kind(
 def absent_channels(
     rig: Rig, detections: Detections, wanted: Collection[str] | None
 ) -> dict[str, list[Finding]]:
-    """List by camera the channels without a capture, of cameras that have captures by another channel.
+    """List, by camera, the channels without captures, if another channel has some.
 
     Args:
         rig: with the channels.
-        detections: of the session.
+        detections: detections of the session.
         wanted: names of the channels that are used; None for all.
     """
     cameras = {camera for camera, _ in detections.images}

@@ -1,4 +1,4 @@
-"""A LiDAR's constant errors from the boards of one or several sessions, and a profile that states them."""
+"""Estimate a LiDAR's constant errors from the boards of one or several sessions, for its profile."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,7 +29,7 @@ from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 
-# Minimum ratio of a laser's range deviation before and after, for the profile to state the new value.
+# Minimum ratio of a laser's range deviation before and after, for its new value to be written.
 _LEAST_GAIN = 2.0
 _FEWEST_CAPTURES = 8
 _STILL = "Give sessions whose board stood still, on a stand. Leave this one out."
@@ -46,7 +46,7 @@ def measure_lidar(
 
     Args:
         sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
-        lidar: its name in the profiles; None for the only one.
+        lidar: the LiDAR's name in the profiles; None for the only one.
         found: detections of each session; None detects the board first.
         progress: called with (done, total) while a session is read.
 
@@ -88,7 +88,7 @@ def measure_lidar(
             candidates, _ = detections.candidates(pair, board)
             clocks = Clocks.of(session.rig, pair.camera, pair.lidar)
             tolerances = Tolerances.of(session.rig.cameras[pair.camera], rig.board)
-            # An error of the lens would move the boards as errors of the ranges do.
+            # A lens error would displace the boards in the same way as range errors.
             with_lens = replace(options, tolerances=tolerances)
             estimate = estimate_extrinsics({pair.channel: candidates}, board, with_lens, clocks)
             _require_still(session, estimate)
@@ -121,7 +121,7 @@ def measure_lidar(
 
 
 def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
-    """Refuse boards that moved while they were captured: the lens and the lasers would absorb the motion."""
+    """Refuse boards that moved during captures: lens and lasers would absorb the motion."""
     if any(channel.time_offset_s is not None for channel in estimate.channels):
         raise ResultRefusedError(f"{session.path}: the board moved while it was captured", _STILL)
 
@@ -129,7 +129,7 @@ def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
 def _require_planes_meet(
     session: Session, observations: Sequence[Observation], board: Board, excess_m: float
 ) -> None:
-    """Refuse boards that moved between image and scan, by their planes after ranges lost their excess."""
+    """Refuse boards that moved between image and scan, from their planes after range correction."""
     nearer = [replace(o, surface=o.lidar.corrected(excess_m)) if excess_m else o for o in observations]
     rms_m, limit_m = solve(nearer, board).diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M
     if rms_m > limit_m:
@@ -137,13 +137,13 @@ def _require_planes_meet(
         raise ResultRefusedError(f"{what} (still boards: under {1e3 * limit_m:.0f} mm)", _STILL)
 
 
-# Of each laser: range, azimuth and elevation, and their standard deviations.
+# Range, azimuth and elevation of each laser, and their standard deviations.
 _OF_LASER = ("range_m", "azimuth_deg", "elevation_deg")
 _SIGMAS = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
 
 
 def lidar_document(errors: LidarErrors) -> dict[str, Any]:
-    """List a LiDAR's errors by the keys that they have in a profile, without lasers only their offset."""
+    """List a LiDAR's errors by profile key; without lasers only their offset."""
     estimate = errors.found
     in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
     figures = np.hstack([estimate.lasers.T * in_degrees, estimate.lasers_sigma.T * in_degrees]).round(7)

@@ -1,4 +1,4 @@
-"""A profile for a rig of one's own: from its data sheets, or from a bag that it recorded."""
+"""A profile for a new rig: from data sheets, or from its recording."""
 
 import re
 from collections.abc import Sequence
@@ -90,7 +90,7 @@ def new_profile(
     """Write the text of a profile.
 
     Args:
-        name: of the rig.
+        name: name of the rig.
         board: as it was measured.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
             folder with images and point clouds. The beams of an unknown LiDAR are measured in it.
@@ -181,7 +181,7 @@ def new_profile(
 
 
 def _survey(recording: Path | None, skipped: list[str]) -> tuple[list[SensorTopic], list[Path], list[Path]]:
-    """List the topics of a bag, or the images and point clouds of a folder; add topics that are skipped.
+    """List the topics of a bag, or the images and point clouds of a folder; also the skipped topics.
 
     Raises:
         SourceError: nothing is there that describes a rig's sensors.
@@ -207,10 +207,10 @@ def _lidar(
     cloud: NDArray[Any] | None,
     where: str,
 ) -> dict[str, Any]:
-    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows.
+    """List the settings of a LiDAR; for an unknown model with the beams found in a point cloud.
 
     Args:
-        name: of the LiDAR.
+        name: name of the LiDAR.
         model: as it was named.
         notes: receives differences between the rings of cloud and model.
         topic: that the cloud is from; None without a bag.
@@ -223,8 +223,8 @@ def _lidar(
     if topic is not None:
         block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
         rate_hz = round(topic.rate_hz or 0.0, 1)
-        # Single scans, seconds apart, say nothing of how fast the LiDAR turns; without rings, scans are
-        # accumulated to the rate of the profile.
+        # Single scans, seconds apart, do not reveal the LiDAR's rate; without rings, scans are accumulated to
+        # the profile's rate.
         block |= {"rate_hz": rate_hz} if rate_hz >= 2.0 and settings.has_rings else {}
     if sheet is not None and sheet.has_rings and cloud is not None:
         try:
@@ -271,7 +271,7 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
     """Measure a LiDAR's beams in one of its scans.
 
     Args:
-        scan: of at least a few metres around, in the LiDAR's own frame.
+        scan: scan of at least a few metres around, in the LiDAR's own frame.
 
     Returns:
         The elevation of each ring in deg, from the lowest; firings of each ring per revolution, None where
@@ -283,7 +283,7 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
 
 
 def parse_board(text: str) -> Board:
-    """Read a board as "8x6,0.07,0.767x0.626", or of another type, as `BOARD_FORM` says.
+    """Parse a board, "8x6,0.07,0.767x0.626" or another type in the form of `BOARD_FORM`.
 
     Raises:
         UsageError: it is not written like this.
@@ -306,7 +306,7 @@ def parse_board(text: str) -> Board:
 
 
 def parse_intrinsics(text: str) -> Intrinsics | CameraFile:
-    """Read a file of a camera, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
+    """Read a camera file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
 
     Raises:
         UsageError: it is neither.
@@ -384,7 +384,7 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
 
 
 def _image_size(images: Sequence[Path]) -> tuple[int, int] | None:
-    """Return the width and height (px) of the first sound image; None without one."""
+    """Return the width and height (px) of the first readable image; None without one."""
     for path in images:
         with suppress(SourceError):
             height, width = read_image(path).shape[:2]

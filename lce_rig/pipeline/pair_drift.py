@@ -41,9 +41,9 @@ class Seen(NamedTuple):
     """One capture of one camera and LiDAR.
 
     Attributes:
-        name: of the capture, or its time.
-        image: of the camera; without one, 20 ms of events.
-        scan: of the LiDAR.
+        name: name of the capture, or its time.
+        image: image of the camera; without one, 20 ms of events.
+        scan: scan of the LiDAR.
         previous: the scan before, in a continuous recording.
     """
 
@@ -71,7 +71,7 @@ class PairDrift:
 
     @property
     def state(self) -> State:
-        """The verdict: a change that one opinion finds and the other does not refute.
+        """The verdict: a change found by one test and not refuted by the other.
 
         It holds if either opinion covers it, and is unknown if they contradict each other.
         """
@@ -82,7 +82,7 @@ class PairDrift:
 
     @property
     def contradictions(self) -> list[Finding]:
-        """The finding that boards hold by which the scene's change is excluded, if they do."""
+        """The finding that the boards exclude the scene's change, if they do."""
         if self.board is None or (self.drift.state, self.board.state) != ("changed", "unchanged"):
             return []
         scene, board = self.drift.change, self.board.joint
@@ -91,7 +91,7 @@ class PairDrift:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Contradictions, then the scene's opinion, then the board's."""
+        """Contradictions, then the result of the scene, then that of the board."""
         board = () if self.board is None else self.board.findings
         return (*self.contradictions, *self.drift.findings, *board)
 
@@ -103,7 +103,7 @@ class PairDrift:
         return next((each.advice for each in self.findings if each.severity != "note" and each.advice), "")
 
     def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
+        """Return all figures as plain types for JSON."""
         is_changed = self.drift.state == "changed"
         return {
             "camera": self.calibration.camera,
@@ -186,7 +186,7 @@ class PairJudge:
                     boards.append((seen, board))
             views.append(view)
         if boards:
-            # The person with the board moves with it.
+            # The person moves with the board.
             views = without_movers(views)
         judged = watch_scene(views, lens, c)
         others: list[Finding] = []
@@ -201,7 +201,7 @@ class PairJudge:
         judged = replace(judged, others=tuple(others))
         example = None
         if whole:
-            # The picture is of the capture with most edges.
+            # Draw the capture with most edges.
             view = max(whole, key=lambda each: len(each.outlines))
             image = next(seen.image for seen in kept if seen.name == view.capture)
             example = view.capture, picture_of(image), view
@@ -231,7 +231,7 @@ class PairJudge:
 
 
 def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> list[Finding]:
-    """Find whether the images of a moving rig fit the scans of another time, as they do a change."""
+    """Check whether the images of a moving rig fit scans of another time as well as a change."""
     is_changed = judged.state == "changed"
     apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
     if apart_s is None:
@@ -240,6 +240,6 @@ def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, 
 
 
 def own_offset_ns(c: Calibration, channel: str) -> int:
-    """Return a channel's calibrated time offset minus the one that the profile expects."""
+    """Return a channel's calibrated time offset minus the profile's expected one."""
     found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
     return round(1e9 * found[0]) if found and found[0] is not None else 0

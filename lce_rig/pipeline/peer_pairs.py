@@ -1,4 +1,4 @@
-"""Two sensors of one kind that saw the same boards: their captures, and the judgement of their pose.
+"""Two sensors of one kind that saw the same boards: their captures, and the verdict on their pose.
 
 In a result T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired
 where one of them has no LiDAR; where both have one, its result relates them.
@@ -41,8 +41,8 @@ class SolvedPeers:
         n_detected: captures with a board in both.
         refused: why others are unusable.
         given: the captures that agree.
-        estimate: of the second one's pose, of LiDARs in an optical frame of the first.
-        validation: of the estimate.
+        estimate: estimate of the second one's pose, of LiDARs in an optical frame of the first.
+        validation: validation of the estimate.
     """
 
     pair: Pair
@@ -54,27 +54,27 @@ class SolvedPeers:
 
     @property
     def names(self) -> tuple[str, str]:
-        """Of the first and the second sensor."""
+        """Names of the first and the second sensor."""
         return self.pair.camera, self.pair.lidar
 
     @property
     def T_view(self) -> Array:
-        """(4, 4) from the first sensor's frame to that of the estimate."""
+        """Transform (4, 4) from the first sensor's frame to that of the estimate."""
         return np.eye(4) if isinstance(self.given, StereoPair) else self.given.T_view
 
     @property
     def T_first_second(self) -> Array:
-        """(4, 4) pose of the second sensor in the first one's frame."""
+        """Pose (4, 4) of the second sensor in the first one's frame."""
         return np.asarray(invert(self.T_view) @ self.estimate.T_cam_lidar)
 
     @property
     def costs(self) -> PairCosts:
-        """Costs of the captures, by which a motion of either sensor shows."""
+        """Costs of the captures, which reveal a motion of either sensor."""
         return PairCosts.of(self.names, self.estimate, self.validation, self.T_view)
 
     @property
     def to_first(self) -> Array:
-        """(6, 6) rotation of tangents into the first sensor's frame."""
+        """Rotation (6, 6) of tangents into the first sensor's frame."""
         return np.kron(np.eye(2), self.T_view[:3, :3].T)
 
     @property
@@ -91,14 +91,14 @@ def solve_peers(
     lenses: Mapping[str, SessionLens | None],
     progress: Progress,
 ) -> tuple[list[SolvedPeers], list[Finding]]:
-    """Estimate the pose of every two sensors of one kind from their own captures alone.
+    """Estimate the relative pose of every two sensors of one kind from their own captures.
 
     Args:
         rig: the profile.
-        detections: of the session.
-        pairs: of two LiDARs or two cameras.
-        options: of the estimate; the method is always of maximum likelihood.
-        lenses: of cameras that have one already.
+        detections: detections of the session.
+        pairs: pairs of two LiDARs or two cameras.
+        options: options of the estimate; the method is always of maximum likelihood.
+        lenses: lenses of cameras that have one already.
         progress: told what is done.
 
     Returns:
@@ -119,12 +119,12 @@ def solve_peers(
 
 
 def with_estimate(rig: Rig, own: SolvedPeers, estimate: CalibrationEstimate) -> SolvedPeers:
-    """Replace the estimate and check it anew."""
+    """Replace the estimate and validate it again."""
     return replace(own, estimate=estimate, validation=_validate(rig, own.pair, own.given, estimate))
 
 
 def find_named(rig: Rig, detections: Detections, own: SolvedPeers) -> list[Finding]:
-    """Find LiDARs whose scans came under another name."""
+    """Find LiDARs whose scans are exchanged."""
     if own.pair.lidar_channel:
         return []
     (first, second), scans = own.names, detections.lidars

@@ -27,7 +27,7 @@ _LONGEST_NAME = 64
 
 
 class WrittenResult(NamedTuple):
-    """The files of a result after they were written.
+    """The written files of a result.
 
     Attributes:
         files: result.json and the exports.
@@ -81,7 +81,7 @@ class Result:
 
     @property
     def provenance(self) -> Provenance:
-        """Robot, sensors and date; raises as `provenance_of`."""
+        """Robot, sensors and date; raises like `provenance_of`."""
         return provenance_of(self.session)
 
     def file(self) -> ResultFile:
@@ -145,7 +145,7 @@ class Result:
         """Draw report.html beside the result.json that `write` has written.
 
         Args:
-            name: as of `write`.
+            name: as in `write`.
 
         Raises:
             SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
@@ -172,11 +172,11 @@ class Result:
 
 
 def result_folder(session: Path, name: str | None = None, *, is_new: bool = False) -> Path:
-    """Give the folder of a session's result; the result before that of a name is `NAME/previous`.
+    """Return the folder of a session's result; the one before a named result is `NAME/previous`.
 
     Args:
         session: the session's folder.
-        name: of the result; None for the main one, in calibration/.
+        name: name of the result; None for the main one, in calibration/.
         is_new: whether it is to be written.
 
     Raises:
@@ -198,11 +198,11 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
 
 
 def with_profile_of(session: Session, name: str | None) -> Session:
-    """Return a session with the profile of one of its results: the one stored beside it, if there is one.
+    """Return a session with the profile stored beside one of its results, if there is one.
 
     Args:
         session: open for reading is enough.
-        name: of the result; None for the one in calibration/, whose profile is the session's.
+        name: name of the result; None for the one in calibration/, whose profile is the session's.
 
     Raises:
         UsageError, ProfileError, SessionError: the name, or the profile there, cannot be used.
@@ -224,7 +224,7 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration], profile
     A manifest holds the SHA-256 of the capture's files.
 
     Args:
-        session: of the captures.
+        session: the session with the captures.
         calibrations: the results.
         profile: content of rig.yaml beside the result, else in the session.
 
@@ -244,7 +244,7 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration], profile
 
 
 def _usable(folder: Path) -> set[str]:
-    """Name the cameras and LiDARs with a result in a folder that did not fail."""
+    """List the cameras and LiDARs with a usable result in a folder."""
     with suppress(LceRigError):
         pairs = read_result(folder / RESULT).pairs
         return {f"{c.camera} and {c.lidar}" for c in pairs if c.verdict != "fail"}
@@ -298,12 +298,12 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
 
 
 class StoredResult(NamedTuple):
-    """A result of a session on the disk.
+    """A session's result on the disk.
 
     Attributes:
         name: "current" and "previous" for those in calibration/, else the name of `calibrate --name`.
         folder: with its result.json.
-        file: its content; None if it cannot be read.
+        file: the file's content; None if it cannot be read.
         problem: why it cannot be read; "" if it can.
         written_s: when it was written, seconds since 1970.
         is_outdated: whether the profile or a capture that it used has changed or is missing.
@@ -318,7 +318,7 @@ class StoredResult(NamedTuple):
 
 
 def stored_results(session: Session) -> list[StoredResult]:
-    """List a session's results: the current one and those with names, each followed by the one before it.
+    """List a session's results: the current and the named ones, each followed by its predecessor.
 
     Raises:
         SessionError: their folders cannot be read.

@@ -1,4 +1,4 @@
-"""Estimate extrinsics without a board: the profile's nominal pose, corrected by the edges of a scene.
+"""Estimate extrinsics without a board: correct the profile's nominal pose by the edges of a scene.
 
 recordings -> views spread over them, stored as captures of a session -> estimate of each camera with each
 LiDAR -> checks, verdict, overlays
@@ -78,7 +78,7 @@ from lce_rig.timing.scan_pairing import EventCut, pair_by_time
 
 OVERLAYS = "scene"
 """Folder of the overlays in the session."""
-_MOST_VIEWS = 16  # More views of one drive add time, and little information.
+_MOST_VIEWS = 16  # Maximum number of views: more of one drive add time and little information.
 _DARK = 40  # Grey value that 1 % of the pixels exceed in the brightest view: below it, images are dark.
 # Correlation of small images above which views show one place, the median of all pairs: 0.63 to 1.0 in nine
 # recordings of standing rigs, with people and boards that move, and 0.13 in twelve views of KITTI's drives.
@@ -88,10 +88,10 @@ _SCENE = "scene"  # Key of a capture's data: its place in the recording.
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The samples of one time.
+    """The samples at one time.
 
     Attributes:
-        name: of the capture that holds them.
+        name: name of the capture that holds them.
         images, scans: of all sensors; scans as recorded.
         events: of each event camera, while the scans were fired.
         previous: the scans before, by LiDAR; empty where the recording is not continuous.
@@ -106,7 +106,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A view of one camera and LiDAR, as overlays show it: the outlines under the poses by name."""
+    """A view of one camera and LiDAR for overlays: the outlines under the named poses."""
 
     camera: str
     lidar: str
@@ -169,7 +169,7 @@ def calibrate_scene(
     """Estimate the extrinsics of every camera with every LiDAR from a scene without a board.
 
     Args:
-        recordings: of one time: folders of images and point clouds, bags, files; or one session.
+        recordings: recordings of one time: folders of images and point clouds, bags, files; or one session.
         session: folder of the session that holds the views; is created. That of a session is the session.
         rig: the profile; None for that of the session.
         cameras: those to calibrate; empty for all.
@@ -231,7 +231,7 @@ def _nominals(rig: Rig, cameras: Sequence[str]) -> list[NominalExtrinsic]:
 
 
 def _read(paths: Sequence[Path], rig: Rig, notes: list[str], progress: Progress) -> list[View]:
-    """Read views of recordings; what is damaged is skipped with a note.
+    """Read views of recordings; damaged ones are skipped with a note.
 
     Raises:
         SourceError: a recording cannot be read at all.
@@ -269,7 +269,7 @@ def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> 
 
 
 def _store(views: Sequence[View], rig: Rig, path: Path) -> list[View]:
-    """Store views as captures of a session, and name them so; those that it holds stay.
+    """Store views as captures of a session and return their names; existing captures stay.
 
     Raises:
         SessionError: the session is of another rig, holds captures of a board, or cannot be written.
@@ -304,7 +304,7 @@ def _stored(session: Session) -> Iterator[View]:
 def calibrate_pair(
     rig: Rig, nominal: NominalExtrinsic, views: Sequence[View]
 ) -> tuple[Calibration | Finding, list[Drawn]]:
-    """Estimate and judge the extrinsics of one camera and LiDAR; a finding where the scene cannot tell."""
+    """Estimate and judge the extrinsics of one camera and LiDAR; a finding if they are undetermined."""
     camera, lidar, T_nominal = nominal.camera, nominal.lidar, nominal.to_matrix()
     lens, settings = rig.cameras[camera].to_intrinsics(), rig.lidars[lidar]
     beam = Beam(settings.beam_aperture_m, settings.beam_divergence_rad)
@@ -375,7 +375,7 @@ def calibrate_pair(
 def _with_lens(
     rig: Rig, camera: str, views: Sequence[OutlineView], estimate: SceneEstimate
 ) -> tuple[Array, Array, Array]:
-    """Let errors of the profile's intrinsics enter the covariance, as of a board's result.
+    """Add the errors of the profile's intrinsics to the covariance, as for a board's result.
 
     Returns:
         Covariance (6, 6) of the extrinsics as used with these intrinsics, their cross-covariance (6, P) with
@@ -419,7 +419,7 @@ def _shortage(subject: str, estimate: SceneEstimate, images: Sequence[Image | Ev
 
 
 def _one_place(subject: str, images: Sequence[Image]) -> list[Finding]:
-    """Find views that all show one place, as of a standing rig."""
+    """Check whether all views show one place, as with a standing rig."""
     small = [cv2.resize(each.grey, _SMALL_PX, interpolation=cv2.INTER_AREA).ravel() for each in images]
     with np.errstate(invalid="ignore", divide="ignore"):  # blank images
         correlations = np.atleast_2d(np.corrcoef(np.asarray(small, dtype=np.float64)))
@@ -433,7 +433,7 @@ def _one_place(subject: str, images: Sequence[Image]) -> list[Finding]:
 def _findings(
     rig: Rig, nominal: NominalExtrinsic, estimate: SceneEstimate, n_untimed: int
 ) -> Iterator[Finding]:
-    """List what keeps extrinsics from a pass."""
+    """List the reasons against a pass."""
     subject = f"{nominal.camera} and {nominal.lidar}"
     target, sigmas = rig.calibration, np.sqrt(np.diag(estimate.cov))
     sigma_deg, sigma_m = sigma_sizes(estimate.cov)

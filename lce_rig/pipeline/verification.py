@@ -47,9 +47,9 @@ class Verification:
         session: the source of the captures.
         checks: one for each channel of a camera and LiDAR with captures in the session.
         calibrations: the extrinsics, including those of sensors without captures.
-        detections: of the session.
+        detections: detections of the session.
         own_result: content of the session's result.json if the calibrations come from it, else None.
-        name: of that result; None for the one in calibration/.
+        name: name of that result; None for the one in calibration/.
         notes: differences between the profiles of session and result.
     """
 
@@ -102,7 +102,7 @@ class Verification:
             return self._draw(draft, place, progress)
 
     def _draw(self, base: Path, place: Path, progress: Progress) -> tuple[SessionCheck, ...]:
-        """Draw into a folder, which will lie at a place."""
+        """Draw into a temporary folder, with links for its final place."""
         drawn = []
         for check in self.checks:
             pair = check.pair
@@ -137,10 +137,10 @@ def verify(
 
     Args:
         session: may differ from the session that the extrinsics come from.
-        result: of `calibrate` or `read_result`; None for the session's result.json.
-        name: of the session's result to check; None for the one in calibration/.
+        result: result of `calibrate` or `read_result`; None for the session's result.json.
+        name: name of the session's result to check; None for the one in calibration/.
         profile: with which the result was made, as `profile_behind` finds it: its lenses count.
-        detections: of this session; None to detect the board first.
+        detections: detections of this session; None to detect the board first.
         progress: called with (done, total) while the board is detected.
 
     Raises:
@@ -164,7 +164,7 @@ def verify(
                 check = check_session(session.rig, detections, c, channel, scene)
                 # A result of this session has been judged by these boards.
                 if not c.captures_used and not c.is_of_peers:
-                    # The six axes together: residuals hide a rotation that a translation undoes.
+                    # Test all six axes jointly: a translation can compensate a rotation in the residuals.
                     key = (pair.camera, pair.channel)
                     alone = Detections(
                         {key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]}
@@ -201,13 +201,13 @@ def profile_behind(path: Path, result: ResultFile) -> Rig | None:
 
 
 def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, ...]]:
-    """Give a rig the lenses with which a result was made, and name the keys that matter and differ.
+    """Apply the lenses of a result to a rig, and name relevant keys that differ.
 
     Another lens moves boards and edges, and would look like a sensor that moved.
 
     Args:
-        rig: of the samples.
-        profile: of the result; None if unknown.
+        rig: profile of the sensors that recorded the samples.
+        profile: profile of the result; None if unknown.
     """
     if profile is None:
         return rig, ()
@@ -244,7 +244,7 @@ def _extrinsics(
         what = f"the result belongs to rig {saved.rig!r}" if calibrations else "the result holds no pair"
         raise SessionError(f"{what}; the session {session.path} belongs to rig {session.rig.name!r}")
     if not is_own:
-        # Names of captures differ between sessions: none of these was fitted.
+        # Capture names differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
     return calibrations, content if is_stored else None
 
@@ -255,11 +255,11 @@ def write_debug_images(
     *,
     progress: Progress = silent,
 ) -> Path:
-    """Draw for every capture each sensor's detection of the board, or why it was refused.
+    """Draw for every capture each sensor's detection of the board, or the refusal.
 
     Args:
         session: the source of the captures.
-        detections: of the session.
+        detections: detections of the session.
         progress: called with (done, total).
 
     Returns:
@@ -276,7 +276,7 @@ def write_debug_images(
         mismatch = refused.get(name)
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
         seen, scan, events = _image(session, pair.camera, pair.channel, capture), None, None
-        with suppress(SessionError):  # The detection of a damaged one says so.
+        with suppress(SessionError):  # The detection reports damaged captures.
             scan = session.scan(capture, pair.lidar)
             if (pair.camera, pair.channel) in event_channels(session.rig, capture):
                 events = capture.events(pair.camera)
@@ -301,7 +301,7 @@ def write_debug_images(
 
 
 def _scan(session: Session, pair: Pair, capture: Capture) -> Scan:
-    """Return a LiDAR's cloud; of two cameras one without points: the second one's corners are drawn."""
+    """Return a LiDAR's point cloud; for two cameras an empty one, as the second one's corners are drawn."""
     if not pair.lidar_channel:
         return session.scan(capture, pair.lidar)
     none = np.zeros(0)
@@ -313,7 +313,7 @@ def _scan(session: Session, pair: Pair, capture: Capture) -> Scan:
 def _image(
     session: Session, camera: str, channel: str, capture: Capture, *, T_view: Array | None = None
 ) -> Image | None:
-    """Return a camera's image, or a LiDAR's cloud as one; None if it is damaged or events gave none."""
+    """Return a camera's image, or a LiDAR's point cloud as one; None if damaged or not reconstructed."""
     with suppress(SessionError):
         if T_view is not None:
             return draw_cloud(session.scan(capture, camera), T_view)

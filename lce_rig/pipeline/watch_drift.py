@@ -1,4 +1,4 @@
-"""Check deployed extrinsics on recordings without a board: the edges of the scene decide.
+"""Check deployed extrinsics on recordings without a board, by the edges of the scene.
 
 Captures come from sessions, recordings of all kinds and attached sensors, in bounded memory.
 """
@@ -39,7 +39,7 @@ class SceneCaptures:
     Args:
         rig: the profile.
         result: the deployed extrinsics.
-        source: its name in messages.
+        source: the source's name in messages.
 
     Attributes:
         kept: by index of the result's pairs.
@@ -114,7 +114,7 @@ class SceneCaptures:
             raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")
 
     def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
-        """Read attached sensors until it is over.
+        """Read attached sensors until the time is over.
 
         Raises:
             SourceError: a sensor cannot be opened.
@@ -134,7 +134,7 @@ class SceneCaptures:
             self.notes += [error.what for error, _ in sensors.lost().values()]
 
     def take_frame(self, frame: Frame) -> None:
-        """Take the rig's samples of one time of a continuous recording."""
+        """Take the rig's samples at one time of a continuous recording."""
         self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
         self._last = {scan.sensor: self._rig.corrected(scan) for scan in frame.scans}
 
@@ -229,7 +229,7 @@ def drift_live(
     Args:
         rig: the profile.
         result: the deployed extrinsics.
-        sources: of every sensor and of the sync board; not open yet.
+        sources: live sources of every sensor and of the sync board; not open yet.
         is_over: asked several times a second with the number of scans so far; True ends it.
 
     Raises:

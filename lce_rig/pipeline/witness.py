@@ -1,4 +1,4 @@
-"""Edges of the scene beside the boards: an independent opinion on extrinsics."""
+"""Edges of the scene outside the boards: an independent check of extrinsics."""
 
 from contextlib import suppress
 
@@ -27,7 +27,7 @@ def hear_scene(
 
     Args:
         session: any session of the rig.
-        detections: of this session: its captures, and where the board is.
+        detections: detections of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
         thumbnails: receives the images that were decoded.
     """
@@ -39,7 +39,7 @@ def hear_scene(
 def scene_views(
     session: Session, detections: Detections, c: Calibration, thumbnails: Thumbnails | None = None
 ) -> list[OutlineView]:
-    """Find the edges of the scene without those at the board; arguments as of `hear_scene`."""
+    """Find the edges of the scene without those at the board; arguments as in `hear_scene`."""
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
     names = sorted(boards.keys() & detections.lidars.get(c.lidar, {}).keys())

@@ -8,7 +8,7 @@ from lce_rig.core.board import Board, BoardType
 from lce_rig.core.pattern import DICTIONARIES, LEAST_CORNERS, n_markers_of
 from lce_rig.rig.settings import Figure, Settings, problem
 
-# Limits of sizes, m; figures beyond them are in millimetres.
+# Limits of sizes, m; larger figures are in millimetres.
 _Side = Annotated[float, Field(ge=0.005, le=5)]
 _Deviation = Annotated[float, Field(ge=0, le=0.2)]
 _LEAST_SQUARE_M = 0.001

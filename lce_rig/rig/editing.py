@@ -40,7 +40,7 @@ def derive_text(
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
     head = f"# {name}: made from {origin} by `rigs new`; the comments below are from {origin}.\n"
-    # The comments above the first key are about the other profile.
+    # The comments above the first key describe the other profile.
     text = head + set_value(text[_compose(text).start_mark.index :], "name", as_yaml(name))
     if "description" in read_document(text, origin).data:
         text = set_value(text, "description", "''")
@@ -48,7 +48,7 @@ def derive_text(
 
 
 def edit_text(text: str, settings: Sequence[tuple[str, str]], source: str) -> str:
-    """Set keys of a profile's text; arguments, result and errors as of `derive_text`."""
+    """Set keys of a profile's text; arguments, result and errors as in `derive_text`."""
     for path, value in settings:
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
@@ -59,7 +59,7 @@ def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[
     """List the keys and values that `edit_text` sets for a camera's intrinsics.
 
     Args:
-        camera: its name.
+        camera: the camera's name.
         lens: with the images' size.
         others: further keys of the block `intrinsics`.
     """
@@ -131,7 +131,7 @@ def _compose(text: str) -> yaml.Node:
 
 
 def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
-    """Follow keys as far as they lead; return the node and how many keys were followed."""
+    """Follow keys as far as they exist; return the node and the number of keys followed."""
     for depth, key in enumerate(keys):
         below = None
         if isinstance(node, yaml.MappingNode):
@@ -145,7 +145,7 @@ def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
 
 
 def _end(node: yaml.Node) -> int:
-    """Find the end of a node's text; a block's own mark is after the comments that follow it."""
+    """Find the end of a node's text; a block's own end mark follows its trailing comments."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

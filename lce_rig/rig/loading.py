@@ -25,7 +25,7 @@ KeyPath = tuple[str | int, ...]
 BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
 """Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
 _SUFFIXES = (".yaml", ".yml")
-# The words of pydantic's messages, and those of ours.
+# Texts of pydantic's messages, and their replacements.
 _REWORDED = (
     ("Input should", "must"),
     ("Tuple should", "must"),
@@ -216,8 +216,8 @@ def read_document(
     Args:
         text: the YAML.
         source: name of the text in errors, usually its file.
-        kind: of file, for the error of a text that is not a mapping.
-        hint: of that error.
+        kind: kind of file, for the error of a text that is not a mapping.
+        hint: hint of that error.
 
     Raises:
         ProfileError: not YAML, not a mapping, or a key given twice; with file and line.

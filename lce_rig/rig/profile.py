@@ -77,7 +77,7 @@ BOARD, PPS_LINE = "sync", "pps"
 """Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
 # CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
 _ROUNDING = 5e-3
-# Two sensors of one rig are not farther apart; larger figures are millimetres.
+# Largest distance of two sensors of one rig, m; larger figures are in millimetres.
 _Metres = Annotated[float, Field(ge=-20, le=20)]
 
 
@@ -112,7 +112,7 @@ class SyncSettings(Settings):
 
     Attributes:
         type: its protocol: lce-rig's own (docs/sync-protocol.md).
-        device: its serial port.
+        device: serial port of the board.
         baud: speed of the port; None for 115200, any over USB.
         triggers: the trigger lines, by the camera's name.
     """
@@ -161,18 +161,18 @@ class Mount(Settings):
 
 
 class NominalExtrinsic(Settings):
-    """The expected pose of a camera; compared with the result, an initial guess of `calibrate --scene` alone.
+    """The expected extrinsics of a camera, compared with the result.
 
-    It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
-    is given in exactly one way.
+    Only `calibrate --scene` uses them as the initial guess. They transform points from the LiDAR's frame to
+    the camera's optical frame: p_cam = R p_lidar + t. Exactly one form of the rotation must be given.
 
     Attributes:
         quaternion_wxyz: unit quaternion of R, scalar first.
         rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
         matrix: the rows of R.
         translation_m: t, the LiDAR's origin in the optical frame.
-        source: "cad", this rig's CAD model, with which the result must agree; or "typical", how such rigs are
-            built: for guidance and simulation, and no test of a result.
+        source: "cad" for this rig's CAD model, with which the result must agree; "typical" for a common
+            mounting of such rigs, used for guidance and simulation but not to judge results.
         tolerance_deg: larger differences from the result are reported.
         tolerance_m: larger differences from the result are reported.
     """
@@ -291,7 +291,7 @@ class Rig(Settings):
         return self.cameras[extrinsics.camera].to_intrinsics() if own is None else own
 
     def with_lenses(self, extrinsics: Sequence[Calibration]) -> "Rig":
-        """Replace the cameras' intrinsics by those that belong to extrinsics; the first of a camera count."""
+        """Replace the cameras' intrinsics by those used with extrinsics; the first of each camera counts."""
         cameras = dict(self.cameras)
         for each in reversed(extrinsics):
             if each.lidar in cameras and each.lidar_intrinsics is not None:

@@ -25,7 +25,7 @@ MAX_PIXELS = 1 << 26
 
 LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
-# Beyond this the figure is in millimetres, or the sensor is broken.
+# Limit above which a figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
@@ -98,7 +98,7 @@ class LaserSettings(Settings):
     """Constant errors of one laser, with their standard deviations about the errors common to all.
 
     Attributes:
-        ring: its number.
+        ring: the ring's number.
         range_m: positive for ranges too long.
         azimuth_deg, elevation_deg: by which its true beam deviates from the reported one.
     """
@@ -136,10 +136,10 @@ class LidarSettings(Settings):
         serial: serial number of this very unit, for devices that do not report it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
-        rate_hz: of its scans. Without rings, scans that come faster are accumulated to this rate.
+        rate_hz: rate of its scans. Without rings, scans that come faster are accumulated to this rate.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
-        elevations_deg: of the rings, lowest first; None for the model's.
+        elevations_deg: elevations of the rings, lowest first; None for the model's.
         columns: firings of each ring per revolution; None for the model's.
         beam_aperture_m: width of the light beam at the sensor's exit; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
@@ -194,7 +194,7 @@ class LidarSettings(Settings):
 
     @property
     def has_rings(self) -> bool:
-        """Whether its beams sweep cones about its axis, as those of LiDARs of unknown models do."""
+        """Whether its beams sweep cones about its axis; assumed for unknown models."""
         sheet = self.data_sheet()
         return sheet is None or sheet.has_rings or self.elevations_deg is not None
 

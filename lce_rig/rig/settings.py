@@ -25,7 +25,7 @@ RobotName = Annotated[str, Field(pattern=_ROBOT, max_length=64)]
 RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
 FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
 TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
-# All figures of a rig lie within; their squares and quotients stay far from overflow.
+# Bounds of all figures of a rig, so that their squares and quotients do not overflow.
 _SMALLEST, _LARGEST = 1e-6, 1e6
 Text = Annotated[str, Field(max_length=1000)]
 Positive = Annotated[float, Field(ge=_SMALLEST, le=_LARGEST)]

@@ -1,1 +1,1 @@
-"""The scene as a witness: depth edges of scans on edges of images."""
+"""Check extrinsics on the scene: depth edges of scans against edges of images."""

@@ -1,4 +1,4 @@
-"""Colours of a scan's points from the image, without points that the camera sees something before."""
+"""Colours of a scan's points from the image, without points that are hidden from the camera."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,20 +7,20 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, transform
 
-# Cells in which the camera's view is compared with the LiDAR's are at least this large.
+# Minimum size of the cells in which the views of camera and LiDAR are compared.
 _SMALLEST_CELL_PX = 4.0
 
 
 def colour_points(
     scan: Scan, pixels: NDArray[np.uint8], T_cam_lidar: Array, lens: Intrinsics
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Give each point of a scan the colour of its nearest pixel.
+    """Assign each point of a scan the colour of its nearest pixel.
 
     Args:
-        scan: of N points; those that are not finite get no colour.
+        scan: scan of N points; those that are not finite get no colour.
         pixels: (H, W) grey or (H, W, 3) BGR, of the camera's resolution.
         T_cam_lidar: (4, 4).
-        lens: of the camera.
+        lens: intrinsics of the camera.
 
     Returns:
         RGB (N, 3), black where the camera does not see the point, and whether it does (N,): in the image,

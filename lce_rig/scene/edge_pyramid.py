@@ -1,4 +1,4 @@
-"""Image edges as smooth fields of several widths, upright and level edges apart."""
+"""Image edges as smooth fields of several widths, separately for vertical and horizontal edges."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from lce_rig.core.geometry import Array
 SIGMAS_RAD = (0.024, 0.012, 0.006, 0.003)
 """Blur of the fields: 1.4 deg, the error of rough extrinsics, down to the width of an outline."""
 
-_WORKING_FOCAL_PX = 1000.0  # Images of a longer focal length are halved first.
+_WORKING_FOCAL_PX = 1000.0  # Focal length above which images are halved first, px.
 _WEAKEST_GREY = 2.0  # Gradient of noise: an image without stronger edges has none.
 _CLIP_PERCENTILE = 99  # of gradients: stronger edges count no more
 _WINDOW_RAD, _WINDOW_SIGMAS = 0.12, 20.0  # Window across an edge, at least, and in sigmas of the blur,
 _WINDOW_ASPECT = 4  # by its length along the edge.
 _FLOOR = 0.005  # of the mean edge strength in a window, as a share of the strongest
-_OUTLIERS = 0.5  # Share of outlines without an image edge.
+_OUTLIERS = 0.5  # Fraction of outlines without an image edge.
 _CLEAR = 0.5  # Log-likelihood ratio of an edge that stands out.
 _SAMPLES_PER_SIGMA = 1.5  # Coarse fields are stored at a lower resolution.
 
@@ -54,11 +54,11 @@ class EdgeLayer:
 
 
 def places(pixels: Array, reduction: int | NDArray[np.intp]) -> NDArray[np.float32]:
-    """Return the places (2, N) of an image's pixels (N, 2) in its fields; far outside where NaN.
+    """Return the positions (2, N) of an image's pixels (N, 2) in its fields; far outside if NaN.
 
     Args:
-        pixels: of the image.
-        reduction: of the field, or of each pixel's field (N,).
+        pixels: pixels of the image.
+        reduction: reduction factor of the field, or of each pixel's field (N,).
     """
     at = (pixels.T + 0.5) / reduction - 0.5
     return np.asarray(np.fmin(np.fmax(at, _FAR_OUTSIDE), -_FAR_OUTSIDE), dtype=np.float32, order="C")
@@ -79,7 +79,7 @@ class EdgePyramid:
     levels: Sequence[tuple[EdgeLayer, EdgeLayer]]
 
     def has_edges_near(self, pixels: Array, reach_px: float) -> NDArray[np.bool_]:
-        """Find which pixels (N, 2) of the image have an upright edge within a distance."""
+        """Find which pixels (N, 2) of the image have a vertical edge within a distance."""
         layer, _ = self.levels[-1]
         side = 2 * round(reach_px / layer.reduction) + 1
         near = np.array(layer.values)
@@ -88,14 +88,14 @@ class EdgePyramid:
 
 
 def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
-    """Turn an image into fields of its upright and its level edges.
+    """Convert an image to fields of its vertical and horizontal edges.
 
     Gradients g are clipped, blurred and compared with their mean over a window, so that busy texture attracts
     nothing: ln(0.5 + 0.5 g / mean g), half of the outlines being without an image edge.
 
     Args:
         grey: (H, W) image.
-        focal_px: of its lens.
+        focal_px: focal length of its lens.
     """
     reduction = 1
     while focal_px / reduction > _WORKING_FOCAL_PX:
@@ -104,25 +104,25 @@ def build_edge_pyramid(grey: NDArray[np.uint8], focal_px: float) -> EdgePyramid:
 
 
 def build_event_pyramid(events: Events, focal_px: float) -> EdgePyramid:
-    """Turn the events of a short time into fields: where brightness changed, an edge passed.
+    """Convert the events of a short time to fields: brightness changes where an edge passes.
 
     Their count per pixel takes the place of both gradients: only edges that move, or that a moving rig
     passes, are in it.
 
     Args:
-        events: of a few hundredths of a second.
-        focal_px: of the lens.
+        events: events of a few hundredths of a second.
+        focal_px: focal length of the lens.
     """
     pixels = events.y.astype(np.intp) * events.width_px + events.x
     counts = np.bincount(pixels, minlength=events.width_px * events.height_px).astype(np.float32)
-    # A flickering pixel counts no more than an edge's.
+    # Clip flickering pixels to the strength of an edge.
     strongest = max(float(np.percentile(counts[counts > 0], _CLIP_PERCENTILE)), 1.0) if len(events) else 1.0
     strength = np.minimum(counts.reshape(events.height_px, events.width_px) / strongest, 1.0)
     return _pyramid((strength, strength), focal_px, 1)
 
 
 def _pyramid(strengths: Sequence[NDArray[np.float32]], focal_px: float, reduction: int) -> EdgePyramid:
-    """Build the fields of upright and of level edges, of given strength, at all widths."""
+    """Build the fields of vertical and horizontal edges, of given strength, at all widths."""
     levels = []
     for sigma_rad in SIGMAS_RAD:
         further = 1

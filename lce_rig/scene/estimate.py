@@ -1,4 +1,4 @@
-"""Extrinsics from the edges of a scene, without a board: one estimate of all six axes, with a covariance."""
+"""Extrinsics from the edges of a scene, without a board: all six axes, with a covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,11 +21,11 @@ REACH = np.array([0.2, 0.2, 0.2, *np.radians([2.0, 2.0, 2.0])])
 """Region searched about the start by default, m and rad."""
 
 _UNITS = np.array([0.05, 0.05, 0.05, *np.radians([0.5, 0.5, 0.5])])  # Steps of like effect, for the search.
-# Random starts at each width of the fields, coarse to fine, and maxima that go on from it.
+# Random starts at each width of the fields, coarse to fine, and maxima kept from it.
 _N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
 _SEARCH_EDGES = 3000  # on all but the finest fields
 _COARSE, _FINE = 1e-6, 2e-9  # Relative gain of a step that ends a climb, on wide fields and the finest
-_SAME = 0.5  # Distance in units under which two maxima are one.
+_SAME = 0.5  # Distance in units below which two maxima are one.
 _BEYOND = 1.5  # Largest distance from the start, in reaches
 
 # Chosen on KITTI's views, simulated rooms and streets, and boards of os1_64, acfr_vlp16, rlfs01 and rlfs02.
@@ -35,21 +35,21 @@ _BIAS = np.array([0.02, 0.02, 0.02, *np.radians([0.03, 0.03, 0.06])])
 _LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
 
 _MIN_EDGES = 60
-MIN_SCORE = 0.10  # Images and scans that do not belong together reach 0.06.
+MIN_SCORE = 0.10  # Unrelated images and scans reach 0.06.
 _MIN_GAIN = 2.0  # Significance over another maximum
 HOLDS_CHI2 = 16.81
 """Largest chi-squared, of six degrees of freedom, of poses that count as one: 99 %."""
-# Non-centrality of a chi-squared of six degrees of freedom that exceeds HOLDS_CHI2 in 95 % of the cases.
+# Non-centrality of a chi-squared of six degrees of freedom that exceeds HOLDS_CHI2 in 95 % of cases.
 _NOTICED = 27.04
-_CONTROL_SIGMAS = 3.0  # Extrinsics moved so far must score less.
-_UNDETERMINED = 0.5  # Standard deviation of a direction that the scene does not determine, in reaches.
+_CONTROL_SIGMAS = 3.0  # Displacement after which extrinsics must score less.
+_UNDETERMINED = 0.5  # Standard deviation of an undetermined direction, in reaches.
 _LENS_STEP_RAD = 1e-3  # Displacement in the image, by focal length, of a difference by the intrinsics
 _FOCAL_STEPS = (-0.02, -0.01, 0.01, 0.02)  # Relative changes of the focal lengths that are compared.
 
 
 @dataclass(frozen=True, eq=False)
 class SceneEstimate:
-    """Extrinsics that the edges of a scene support.
+    """Extrinsics supported by the edges of a scene.
 
     Attributes:
         T_cam_lidar: (4, 4).
@@ -72,7 +72,7 @@ class SceneEstimate:
 
     @property
     def undetermined(self) -> tuple[tuple[str, ...], ...]:
-        """Directions that the scene does not determine, each by the names of its main axes."""
+        """Undetermined directions of the scene, each by the names of its main axes."""
         variances, directions = np.linalg.eigh(self.cov / np.outer(self.reach, self.reach))
         wide = directions[:, variances > _UNDETERMINED**2].T
         return tuple(tuple(np.array(MOTIONS)[each**2 > np.mean(each**2)].tolist()) for each in wide)
@@ -83,7 +83,7 @@ class SceneEstimate:
         return float(tangent @ np.linalg.solve(self.cov if cov is None else self.cov + cov, tangent))
 
     def smallest_changes(self, cov: Array) -> tuple[float, float]:
-        """Return the smallest rotation (deg) and translation (m), of any direction, that would be noticed.
+        """Return the smallest rotation (deg) and translation (m) in any direction that would be detected.
 
         Noticed is a chi-squared beyond 99 % of unchanged extrinsics, in 95 % of the cases.
 
@@ -105,8 +105,8 @@ def estimate_scene(
     whose edges match nowhere, adds a constant: it has no veto.
 
     Args:
-        views: of one drive or room.
-        intrinsics: of the camera.
+        views: images and scans of one drive or room.
+        intrinsics: intrinsics of the camera.
         T_start: (4, 4) rough extrinsics.
         reach: (6,) largest error of each axis of the start, m and rad.
     """
@@ -136,13 +136,13 @@ def estimate_scene(
 def find_better_focal(
     views: Sequence[OutlineView], intrinsics: Intrinsics, T_cam_lidar: Array
 ) -> float | None:
-    """Find a relative change of the focal lengths with which the edges fit significantly better.
+    """Find a relative change of the focal lengths that improves the fit of edges significantly.
 
     Wrong focal lengths move the camera along its line of sight: 2 % by 0.2 m in a street.
 
     Args:
-        views: as of `estimate_scene`.
-        intrinsics: of the camera.
+        views: as in `estimate_scene`.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) the estimate.
 
     Returns:
@@ -163,7 +163,7 @@ def find_better_focal(
 
 
 def _climb(score: OutlineScore, start: Array, reach: Array, precision: float = _FINE) -> tuple[Array, float]:
-    """Climb from a start to the next maximum (6,), until steps gain less than `precision`, relatively.
+    """Climb from a start to the next maximum (6,), until the relative gain of a step is below `precision`.
 
     Returns:
         The maximum and its value.
@@ -213,7 +213,7 @@ def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
 
 
 def _gain(score: OutlineScore, best: Array, others: Sequence[Array], cov: Array) -> float:
-    """Compute the least significance, by blocks, of the maximum over others that its covariance excludes."""
+    """Compute the minimum significance, by blocks, of the maximum over others outside its covariance."""
     others = [other for other in others if (other - best) @ np.linalg.solve(cov, other - best) > HOLDS_CHI2]
     return min((significance(score, best, score, other) for other in others), default=np.inf)
 
@@ -226,7 +226,7 @@ def significance(score: OutlineScore, tangent: Array, other: OutlineScore, other
 
 
 def _controls(best: Array, cov: Array) -> list[Array]:
-    """Move the maximum along the eigen-directions of its covariance, to both sides."""
+    """Move the maximum along the eigenvectors of its covariance, to both sides."""
     variances, directions = np.linalg.eigh(cov / np.outer(_UNITS, _UNITS))
     steps = _CONTROL_SIGMAS * _UNITS[:, None] * directions * np.sqrt(variances)
     return [best + sign * step for step in steps.T for sign in (1, -1)]
@@ -266,14 +266,14 @@ def _inverse_curvature(score: OutlineScore, tangent: Array) -> Array:
 def follow_lens(
     views: Sequence[OutlineView], intrinsics: Intrinsics, T_cam_lidar: Array, changes: Array
 ) -> Array:
-    """Compute by which tangents (6, n) an estimate follows small changes of the intrinsics.
+    """Compute the tangents (6, n) by which an estimate follows small changes of the intrinsics.
 
     The maximum moves by -H^-1 G with the curvature H of the score and the change G of its slope: by a
     rotation, mostly, for a principal point; along the line of sight for focal lengths.
 
     Args:
-        views: as of `estimate_scene`.
-        intrinsics: of the camera.
+        views: as in `estimate_scene`.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) the estimate.
         changes: (P, n) of the parameters of its `model_of`.
     """

@@ -1,4 +1,4 @@
-"""Kinds of findings of a scene's edges, and of boards in view, on deployed extrinsics."""
+"""Kinds of findings on deployed extrinsics, from a scene's edges and boards in view."""
 
 from lce_rig.core.findings import Kind
 
@@ -31,7 +31,7 @@ DOUBTFUL = Kind(
 )
 UNKNOWN = Kind(
     "scene.unknown",
-    "scene: the edges cannot tell below {smallest_deg:deg}, {smallest_m:mm}",
+    "scene: the edges do not determine changes below {smallest_deg:deg}, {smallest_m:mm}",
     _RECORD,
     severity="warning",
 )

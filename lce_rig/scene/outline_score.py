@@ -27,8 +27,8 @@ class OutlineView:
     """Edges of one scan and of one image of the same scene.
 
     Attributes:
-        capture: its name.
-        outlines: of the scan, near the image.
+        capture: the capture's name.
+        outlines: outlines of the scan, near the image.
         pyramid: fields of the image's edges.
     """
 
@@ -44,10 +44,10 @@ def build_outline_view(
 
     Args:
         capture: name of the view.
-        image: of the camera, or its events about the scan.
-        scan: of the LiDAR.
-        beam: of the LiDAR.
-        intrinsics: of the camera.
+        image: image of the camera, or its events about the scan.
+        scan: scan of the LiDAR.
+        beam: beam of the LiDAR.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) rough extrinsics, within a few degrees.
     """
     at_camera = transform(T_cam_lidar, scan.points)
@@ -70,7 +70,7 @@ class OutlineScore:
 
     Args:
         views: at least one with an outline.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) that tangents start from.
         level: index of SIGMAS_RAD.
     """
@@ -81,13 +81,13 @@ class OutlineScore:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         order = [np.argsort(view.outlines.kind == LEVEL, kind="stable") for view in views]
         outlines = [view.outlines.select(each) for view, each in zip(views, order, strict=True)]
-        # Coordinates one behind the other: numpy takes them apart faster.
+        # Store each coordinate contiguously: numpy processes them faster.
         self._points = np.concatenate([each.points for each in outlines]).T.copy().T
         weight = np.concatenate([each.weight for each in outlines])
         self._weight = weight / max(weight.sum(), 1e-12)
         self._kind = np.concatenate([each.kind for each in outlines])
         self._view = np.repeat(np.arange(len(views)), [len(each) for each in outlines])
-        # Upright outlines and reflectivities of a view first, then its level outlines.
+        # Vertical outlines and reflectivities of a view first, then its horizontal outlines.
         counts = [(int(np.sum(each.kind != LEVEL)), int(np.sum(each.kind == LEVEL))) for each in outlines]
         ends = np.cumsum([0, *(count for pair in counts for count in pair)]).tolist()
         self._layers = [
@@ -145,7 +145,7 @@ class OutlineScore:
         return float(shares.sum()), np.concatenate([slope[:3], left.T @ slope[3:]])
 
     def of_matching_views(self, tangent: Array) -> float:
-        """Score extrinsics by the views that match better than by chance: the others say nothing."""
+        """Score extrinsics by the views that match better than by chance; the others have no weight."""
         shares, _, _ = self.edges(tangent)
         total, weight = (np.bincount(self._view, each) for each in (shares, self._weight))
         matches = total > 0

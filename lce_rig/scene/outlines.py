@@ -1,4 +1,4 @@
-"""Outlines of near objects in a point cloud, with the direction in which each is crossed."""
+"""Outlines of near objects in a point cloud, with the direction across each."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,7 @@ _NEAR_RAD = 0.016  # Largest angle to a neighbour: twice the gap between the low
 _JUMP_M = 0.3  # Smallest jump of range at an outline: above the relief of one surface, twice `_JOINT_M`.
 # Smallest ratio of a jump to the step on the near surface, which a slanted wall has as well.
 _JUMP_STEPS = 3.0
-_FULL_JUMP_M = 3.0  # Larger jumps have no larger weight.
+_FULL_JUMP_M = 3.0  # Jump above which the weight no longer grows.
 _JOINT_M, _JOINT_SHARE = 0.15, 0.02  # Largest step on one surface: m, and share of the range.
 
 _BRIGHT_PERCENTILE = 95  # Reflectivity taken as 1; road signs are far brighter.
@@ -75,7 +75,7 @@ class _Neighbours:
 
 
 def find_outlines(points: NDArray[Any], intensity: NDArray[Any], beam: Beam) -> Outlines:
-    """Find outlines of near objects in four directions, and upright changes of reflectivity.
+    """Find outlines of near objects in four directions, and vertical edges of reflectivity.
 
     Neighbours by angle take the place of rings, so that LiDARs without rings have outlines as well. Sparse
     rings have no neighbours above and below, and so no level outlines.
@@ -83,7 +83,7 @@ def find_outlines(points: NDArray[Any], intensity: NDArray[Any], beam: Beam) -> 
     Args:
         points: (N, 3) m, frame lidar.
         intensity: (N,).
-        beam: of this LiDAR.
+        beam: beam of this LiDAR.
     """
     points = np.asarray(points, dtype=np.float64)
     range_m = np.linalg.norm(points, axis=1)
@@ -128,7 +128,7 @@ def _jumps(
     kept = np.flatnonzero(keep)
     slope_m = step_m[kept] * np.maximum(gap_rad[kept] / np.maximum(step_rad[kept], 1e-4), 1.0)
     kept = kept[jump[kept] > _JUMP_STEPS * slope_m]
-    # A return belongs to the near object while any part of the beam meets it.
+    # A return belongs to the near object as long as any part of the beam hits it.
     beam_rad = beam.half_width_m(range_m[kept]) / range_m[kept]
     turn_rad = side * np.maximum(gap_rad[kept] / 2 - beam_rad, -gap_rad[kept] / 2)
     moved = _turned(points[kept], range_m[kept], axis, turn_rad)
@@ -137,7 +137,7 @@ def _jumps(
 
 
 def _turned(points: Array, range_m: Array, axis: int, turn_rad: Array) -> Array:
-    """Turn points (N, 3) along azimuth (axis 0, angle on the sphere) or elevation (axis 1)."""
+    """Rotate points (N, 3) along azimuth (axis 0, angle on the sphere) or elevation (axis 1)."""
     flat_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     azimuth, elevation = np.arctan2(points[:, 1], points[:, 0]), np.arctan2(points[:, 2], flat_m)
     if axis == 0:

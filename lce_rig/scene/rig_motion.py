@@ -1,4 +1,4 @@
-"""How a rig moves while it records: edges at the time of an image, and whether the clocks agree."""
+"""Motion of a rig while it records: edges at the time of an image, and consistency of the clocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
 _LONGEST_GAP_S = 0.5
 _VOXEL_M = 0.15
 _REACH_M = 0.6  # of the first round of matching
-_ROBUST_M = 0.1  # Residuals beyond this hardly count: people and cars move otherwise.
+_ROBUST_M = 0.1  # Residuals above this have little weight: people and cars move differently.
 _MIN_FITNESS = 0.5
 _NORMALS_M = 0.8
 _CLOCKS_S = np.linspace(-0.15, 0.15, 31)
-# Smallest time offset that cannot come from motion that is not quite constant, s.
+# Smallest time offset not explained by slightly varying motion, s.
 _APART_S = 0.02
 _APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
-# Share of the score below which clocks explain images less well than changed extrinsics do.
+# Fraction of the score below which clocks explain images less well than changed extrinsics.
 _NEARLY = 0.1
 
 
@@ -43,13 +43,13 @@ class RigMotion:
 
     @property
     def is_still(self) -> bool:
-        """Whether it is too slow to be significant."""
+        """Whether the motion is too slow to be significant."""
         return bool(
             np.linalg.norm(self.velocity_mps) < _STILL_MPS and np.linalg.norm(self.rate_rad_s) < _STILL_RAD_S
         )
 
     def moved(self, points: Array, after_s: Array) -> Array:
-        """Give standing points as the LiDAR has them some time later.
+        """Return static points as the LiDAR would measure them some time later.
 
             p' = exp(w dt)^T (p - v dt)
 
@@ -100,7 +100,7 @@ def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
 
 
 def firing_times_s(scan: Scan, points: Array) -> Array | None:
-    """Compute the time of points (N, 3) of a scan, or beside its returns, s after its first firing."""
+    """Compute the time of points (N, 3) in or near a scan, s after its first firing."""
     from scipy.spatial import cKDTree
 
     if scan.offset_ns is None or not len(scan.points):
@@ -112,7 +112,7 @@ def firing_times_s(scan: Scan, points: Array) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class MovingView:
-    """A capture of a moving rig, its edges as they were at the image's time, and the motion."""
+    """A capture of a moving rig, its edges at the image's time, and the motion."""
 
     view: OutlineView
     motion: RigMotion
@@ -127,7 +127,7 @@ def clocks_apart_s(
 
     Args:
         views: the captures.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) deployed.
         T_changed: (4, 4) changed extrinsics that explain the images otherwise.
 

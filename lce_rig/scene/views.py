@@ -23,14 +23,14 @@ MAX_CAPTURES = 60
 """More captures add time and memory but, of one place, no information: they are thinned out evenly."""
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.05, 0.01  # noise of ranges; azimuth steps
-_MAX_COMPARED = 10  # More captures of one place add no information.
+_MAX_COMPARED = 10  # Maximum number of captures: more of one place add no information.
 _STANDING_SHARE = 0.5  # of all edges that recur before a standing rig
 
 
 def build_view(
     rig: Rig, extrinsics: Calibration, name: str, image: Image | Events, scan: Scan
 ) -> OutlineView:
-    """Find the edges of one capture's scan, and of its image or of events about the scan."""
+    """Find the edges of one capture's scan, and of its image or of events around the scan."""
     lidar, lens = rig.lidars[extrinsics.lidar], rig.lens_of(extrinsics)
     beam = Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad)
     return build_outline_view(name, image, scan, beam, lens, extrinsics.T_cam_lidar)
@@ -39,7 +39,7 @@ def build_view(
 def without_board(
     view: OutlineView, found: ImageBoard | Refusal, rig: Rig, extrinsics: Calibration
 ) -> OutlineView:
-    """Leave out the edges at and near the board, if the image shows one."""
+    """Remove the edges at and near the board, if the image shows one."""
     if isinstance(found, Refusal):
         return view
     lens = rig.lens_of(extrinsics)
@@ -52,7 +52,7 @@ def without_board(
 
 
 def without_movers(views: Sequence[OutlineView]) -> list[OutlineView]:
-    """Remove the edges of things that move before a standing rig, such as the person with the board.
+    """Remove the edges of objects that move in front of a standing rig, such as a person with the board.
 
     An edge stays if a third of the other captures, and one at least, have one in its place; it may be hidden
     in the rest. Where few edges stay, the rig itself moves, and all are kept.

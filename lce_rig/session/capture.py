@@ -43,7 +43,7 @@ class Entry(_Record):
     camera: Name = ""
     channel: Name = ""
     lidar: Name = ""
-    # No manifest names a file outside its folder.
+    # Manifests must not name files outside their folder.
     file: Annotated[str, Field(pattern=f"^{SAFE_NAME.pattern}$")]
     bytes: int
     sha256: str
@@ -87,7 +87,7 @@ class Manifest(_Record):
 
 @dataclass(frozen=True)
 class Capture:
-    """One board placement as the sensors recorded it.
+    """One board placement as recorded by the sensors.
 
     Attributes:
         path: the capture's folder; its name is the capture's.
@@ -131,7 +131,7 @@ class Capture:
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial numbers by sensor, as far as the devices had reported them."""
+        """Serial numbers by sensor, if the devices reported them."""
         serials = self._manifest.meta.get(SERIALS)
         items = serials.items() if isinstance(serials, dict) else ()
         return {name: serial for name, serial in items if isinstance(serial, str) and serial}
@@ -167,7 +167,7 @@ class Capture:
         return sorted(entry.camera for entry in self._manifest.files if entry.kind == "events")
 
     def has_image(self, camera: str, channel: str) -> bool:
-        """Return whether this capture has an image of that camera and channel."""
+        """Check whether this capture has an image of the camera and channel."""
         return (camera, channel) in self.image_keys
 
     def image(self, camera: str, channel: str) -> Image:
@@ -203,7 +203,7 @@ class Capture:
             )
 
     def events(self, camera: str) -> Events:
-        """Read the events about this capture exactly as they were recorded, timestamps to the microsecond.
+        """Read the events around this capture exactly as recorded, timestamps to the microsecond.
 
         Raises:
             SessionError: there are none, or they are damaged.
@@ -283,7 +283,7 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
 
 
 def check_capture(rig: Rig, capture: Capture) -> None:
-    """Check that a capture that was read names sensors of its rig only.
+    """Check that all sensors in a capture belong to its rig.
 
     Raises:
         SessionError: it names another sensor, or its manifest is damaged.
@@ -296,7 +296,7 @@ def check_capture(rig: Rig, capture: Capture) -> None:
 
 
 def _foreign(sources: Sequence[str], rig: Rig) -> str | None:
-    """Name the first source that a rig lacks; None if it has all."""
+    """Return the first source missing in a rig; None if it has all."""
     known = {f"scan of {name}" for name in rig.lidars}
     for name, camera in rig.cameras.items():
         known |= {f"image of {name}.{channel}" for channel in camera.channels}

@@ -32,7 +32,7 @@ def write_new_file(path: Path, data: bytes) -> None:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file's content by `data` in one step: readers see the old or the new content, never a part.
+    """Replace a file's content by `data` atomically: readers see the old or the new content.
 
     Raises:
         OSError: a full disk, no permission.
@@ -50,10 +50,10 @@ def replace_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
-    """Turn a failure to write into one error with the action against it.
+    """Convert a failure to write into one error with an action.
 
     Args:
-        path: of the file or folder.
+        path: path of the file or folder.
         n_safe: captures before it, which are safe.
 
     Raises:
@@ -73,7 +73,7 @@ def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file, and its folder, so that it is there whole or not at all; raises as `writing`."""
+    """Write a file and its folder atomically; raises like `writing`."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, content.encode() if isinstance(content, str) else content)
@@ -99,7 +99,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except Exception:  # An entry of another version can fail in any way.
+    except Exception:  # Entries of other versions may fail in any way.
         return None
 
 
@@ -185,7 +185,7 @@ def replacing(
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
             for other in root.glob(f"{DRAFT}{folder.name}-*"):
-                # Drafts of killed processes; those of running ones are locked.
+                # Drafts of killed processes; drafts of running ones are locked.
                 with suppress(OSError), _locked(other, waits=False):
                     shutil.rmtree(other, ignore_errors=True)
             draft.mkdir()
@@ -233,7 +233,7 @@ def recover(root: Path) -> None:
 
 
 def copy_over(source: Path, target: Path) -> None:
-    """Copy a file or folder, its data shared with the source's where the file system has hard links.
+    """Copy a file or folder, using hard links where the file system has them.
 
     Raises:
         OSError: a full disk, no permission.
@@ -254,7 +254,7 @@ def _link_or_copy(source: str, target: str) -> None:
 
 
 def _put_back(root: Path) -> None:
-    """Move each folder that was put aside back if its place is free, else remove it."""
+    """Move each saved folder back if its place is free, else remove it."""
     for aside in root.glob(f"{ASIDE}*"):
         folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
         if folder.exists():

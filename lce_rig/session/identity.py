@@ -1,4 +1,4 @@
-"""Recognition of session folders and of their rig."""
+"""Recognise session folders and their rig."""
 
 import json
 import re
@@ -54,11 +54,11 @@ def read_marker(path: Path) -> str:
 
 
 class DifferingKey(NamedTuple):
-    """A key in which two profiles differ.
+    """A key that differs between two profiles.
 
     Attributes:
-        path: of the key, such as ("cameras", "davis", "frame").
-        theirs, ours: its values, "absent" where a profile does not have it.
+        path: path of the key, such as ("cameras", "davis", "frame").
+        theirs, ours: values of the key, "absent" if a profile lacks it.
     """
 
     path: tuple[str, ...]
@@ -80,7 +80,7 @@ class DifferingKey(NamedTuple):
 
 
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
-    """List the keys in which two profiles differ, with both values.
+    """List the keys that differ between two profiles, with both values.
 
     The description, the nominal extrinsics, and the addresses of attached sensors may
     differ, as no capture depends on them. The robot and serial numbers may be absent in either.
@@ -96,7 +96,7 @@ def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
 
 
 def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
-    """List the keys by which two profiles are of different rigs: name, robot, sensors and their channels.
+    """List the keys that show that two profiles are of different rigs: name, robot, sensors, channels.
 
     Board, intrinsics, limits and other measured or chosen values may differ.
     """

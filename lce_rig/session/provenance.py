@@ -1,4 +1,4 @@
-"""Where a result comes from: which robot, which sensors, when, and a fingerprint of its inputs."""
+"""Origin of a result: robot, sensors, date, and a fingerprint of its inputs."""
 
 import hashlib
 import json
@@ -13,13 +13,13 @@ from lce_rig.rig import Rig
 from lce_rig.session.capture import Capture
 from lce_rig.session.session import CAPTURED, Session
 
-# Timestamps before 2000 count from somewhere else than 1970, most often from when the sensor was switched on.
+# Timestamps before 2000 do not count from 1970, but usually from the sensor's start.
 _FIRST_UTC_NS = 946_684_800 * 10**9
 _LAST_UTC_NS = 4_102_444_800 * 10**9
 
 
 def provenance_of(session: Session) -> Provenance:
-    """Gather where a result comes from.
+    """Collect the origin of a result.
 
     Raises:
         SessionError: two units of one sensor took the captures.
@@ -41,7 +41,7 @@ def provenance_of(session: Session) -> Provenance:
 
 
 def serials_of(session: Session) -> dict[str, str]:
-    """Return the serial number of each sensor that reported one, or whose profile states one.
+    """Return the serial number of each sensor, as reported or stated in the profile.
 
     Raises:
         SessionError: two units of one sensor took the captures.
@@ -61,7 +61,7 @@ def serials_of(session: Session) -> dict[str, str]:
 
 
 def stated_serials(rig: Rig) -> dict[str, str]:
-    """List the serial numbers that a profile states, by sensor."""
+    """List the serial numbers in a profile, by sensor."""
     lidars = {name: lidar.serial for name, lidar in rig.lidars.items() if lidar.serial}
     return lidars | {name: camera.serial for name, camera in rig.cameras.items() if camera.serial}
 
@@ -97,7 +97,7 @@ def content_sha256(session: Session) -> str:
 
 
 def _profile(rig: Rig) -> dict[str, Any]:
-    """Return the parts of a profile that a result depends on."""
+    """Return the parts of a profile that affect a result."""
     profile = rig.model_dump(mode="json", exclude_defaults=True, exclude={"description", "robot", "exports"})
     for kind in ("lidars", "cameras"):
         for sensor in profile.get(kind, {}).values():

@@ -46,7 +46,7 @@ PROFILE_TEXT = "profile.yaml"
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
 CAPTURED = "captured"
 """The journal's event of a capture."""
-# The keys of a profile by which captures are read.
+# Keys of a profile that affect the reading of captures.
 _OF_CAPTURES = ("name", "robot", "board", "cameras", "lidars")
 CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
 
@@ -181,7 +181,8 @@ class Session:
         if adopted == self.rig:
             return ""
         n = next(n for n in count(1) if not (self.path / f"rig-{n}.yaml").exists())
-        # The earlier one first: stopped here, the session is as it was, with a copy of its profile.
+        # Write the earlier one first: if stopped here, the session is unchanged except for a copy of its
+        # profile.
         for name, kept in ((PROFILE, f"rig-{n}.yaml"), (PROFILE_TEXT, f"profile-{n}.yaml")):
             if (self.path / name).exists():
                 write_atomically(self.path / kept, (self.path / name).read_bytes())
@@ -194,7 +195,7 @@ class Session:
         """Return the session, open for reading, with another profile of the same rig; files do not change.
 
         Args:
-            rig: as of `adopt`.
+            rig: as in `adopt`.
 
         Raises:
             SessionError: the profile is of another rig.
@@ -210,7 +211,7 @@ class Session:
         return self._other_profile
 
     def profile_content(self) -> bytes:
-        """Read the profile in use, as rig.yaml holds it."""
+        """Read the profile in use, as stored in rig.yaml."""
         other = self._other_profile
         return (self.path / PROFILE).read_bytes() if other is None else other.encode()
 
@@ -273,7 +274,7 @@ class Session:
 
     @property
     def rejected(self) -> list[Capture]:
-        """All rejected captures, sorted by name; they are not used, and `restore` takes one back.
+        """All rejected captures, sorted by name; they are not used, and `restore` restores one.
 
         Raises:
             SessionError: their folder may not be read.
@@ -305,10 +306,10 @@ class Session:
         return self.rig.corrected(capture.scan(lidar))
 
     def reject(self, name: str, reason: str = "") -> None:
-        """Put a capture aside: it is no longer used, and not collected again.
+        """Reject a capture: it is no longer used, and not collected again.
 
         Args:
-            name: of the capture.
+            name: name of the capture.
             reason: kept in the journal.
 
         Raises:
@@ -318,7 +319,7 @@ class Session:
         self._move(name, CAPTURES, REJECTED, "rejected", reason=reason)
 
     def restore(self, name: str) -> None:
-        """Take a rejected capture back; raises as `reject`."""
+        """Restore a rejected capture; raises like `reject`."""
         if all(capture.name != name for capture in self.rejected):
             names = ", ".join(capture.name for capture in self.rejected) or "none"
             raise SessionError(
@@ -327,12 +328,12 @@ class Session:
         self._move(name, REJECTED, CAPTURES, "restored")
 
     def _move(self, name: str, source: str, target: str, event: str, **fields: str) -> None:
-        """Move a capture's folder in one step: it is in one of the two places at any time."""
+        """Move a capture's folder atomically."""
         self._require_lock()
         old, new = self.path / source / name, self.path / target / name
         if new.exists():
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
-        # First, so that the capture does not move if the disk is full.
+        # Write the journal first, so that the capture does not move if the disk is full.
         self.journal(event, capture=name, **fields)
         with writing(new):
             new.parent.mkdir(exist_ok=True)
@@ -391,10 +392,10 @@ class Session:
         return name
 
     def add_session(self, other: "Session") -> list[str]:
-        """Copy the captures of another session of this rig, except those that this one holds or has rejected.
+        """Copy the captures of another session of this rig, except those already held or rejected here.
 
         Args:
-            other: of the same board and sensors; limits and targets may differ.
+            other: a profile of the same board and sensors; limits and targets may differ.
 
         Returns:
             The names of the copies.

@@ -1,4 +1,4 @@
-"""Pages: files that load nothing, with everything escaped that is put into them."""
+"""Self-contained pages: everything inserted is escaped."""
 
 import re
 from functools import cache
@@ -9,7 +9,7 @@ from markupsafe import Markup, escape
 
 @cache
 def environment() -> Environment:
-    """Give the templates: everything that is put into them is escaped, and nothing may be missing."""
+    """Return the templates: everything inserted is escaped, and missing values are errors."""
     made = Environment(
         loader=PackageLoader("lce_rig.show.report"),
         autoescape=True,
@@ -22,13 +22,13 @@ def environment() -> Environment:
 
 
 def as_markup(text: str) -> Markup:
-    """Set words of findings for a page: commands between backquotes as code, +- as one sign."""
+    """Format finding texts for a page: commands between backquotes as code, +- as one sign."""
     escaped = str(escape(text)).replace("+-", "±")
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped).replace("\n", "<br>"))
 
 
 def render(template: str, **values: object) -> str:
-    """Write a page: the same values give the same bytes.
+    """Write a page; the same values give the same bytes.
 
     Args:
         template: file of `templates/`; it extends frame.html.

@@ -30,7 +30,7 @@ _MIDDLE = 0.36
 _MOST_STEPS, _MOST_EQUAL_STEPS = 5, 8
 # Share of the range that stays free on either side.
 _MARGIN = 0.05
-# Farther marks are moved here, outside every drawing.
+# Distant marks are moved here, outside every drawing.
 _FAR = 1e4
 # An arrow's half-widths of shaft and head, and the length of its head.
 _SHAFT, _HEAD, _HEAD_LENGTH = 0.6, 1.8, 5.4
@@ -40,7 +40,7 @@ def padded(*values: Array, least: float = 0.0) -> tuple[float, float]:
     """Return limits around all finite values with a margin.
 
     Args:
-        values: of any shapes.
+        values: values of any shapes.
         least: smallest margin, in their unit; equal values get 1 if it is 0.
     """
     every = np.concatenate([np.ravel(each) for each in values])
@@ -84,7 +84,7 @@ class Axes:
         """Draw the axes.
 
         Args:
-            height: of the whole drawing.
+            height: height of the whole drawing.
             x_limits: data at the left and right end; descending ones mirror the axis.
             y_limits: data at the lower and upper end.
             x_label: quantity and unit.
@@ -164,7 +164,7 @@ class Axes:
 
         Args:
             points: their middles.
-            colour: of this module.
+            colour: a colour name of this module.
             size: the diameter, or the side of a square.
             shape: "round" or "square".
         """
@@ -183,7 +183,7 @@ class Axes:
         Args:
             starts: their tails.
             vectors: (N, 2) in data units.
-            colour: of this module.
+            colour: a colour name of this module.
             unit: length in data units of the key's arrow.
             key: its label.
         """
@@ -202,7 +202,7 @@ class Axes:
 
         Args:
             label: its content, for screen readers.
-            name: of its clipping path, unique in the page.
+            name: name of its clipping path, unique in the page.
         """
         left, top, right, bottom = self._box
         parts = [

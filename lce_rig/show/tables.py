@@ -23,8 +23,8 @@ class Table(NamedTuple):
 
     Attributes:
         title: above it.
-        headings: of the columns.
-        rows: of cells.
+        headings: headings of the columns.
+        rows: rows of cells.
         n_texts: the first columns hold text, the others figures.
     """
 
@@ -35,7 +35,7 @@ class Table(NamedTuple):
 
 
 def result_tables(c: Calibration) -> dict[str, Table]:
-    """List all tables of a result, in the order in which they are read."""
+    """List all tables of a result, in reading order."""
     first = c.camera if c.is_of_peers else "the camera"
     pose = f"Pose of {c.lidar} on {c.camera}" if c.is_of_peers else "Pose of the camera on the LiDAR"
     points = [
@@ -117,7 +117,7 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
     rows: list[Row] = []
     for variance, direction in zip(variances[::-1], directions.T[::-1], strict=True):
         sigma = math.sqrt(max(variance, 0.0))
-        # Eigenvectors have no sign of their own.
+        # The sign of an eigenvector is arbitrary: make its largest component positive.
         direction = direction * np.sign(direction[np.abs(direction).argmax()])
         size = f"{math.degrees(sigma):.3f} deg" if unit == "deg" else f"{1000 * sigma:.1f} mm"
         rows.append((kind, "(" + ", ".join(f"{value + 0.0:+.2f}" for value in direction) + ")", size))

@@ -25,7 +25,7 @@ def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster
         lamps: (P, 3) m, facing down.
         points: (N, 3) m.
         normals: (N, 3) unit.
-        occluders: of the lamps.
+        occluders: occluders of the lamps.
 
     Returns:
         (N, 3) linear (blue, green, red).
@@ -63,7 +63,7 @@ class Backdrop:
     """A camera at its pose in the room, with its image of the room.
 
     Attributes:
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         T_world_cam: (4, 4).
         corner_rays: (H + 1, W + 1, 3) unit rays through the pixels' corners, world.
         radiance: (H, W, 3) linear (blue, green, red).
@@ -87,7 +87,7 @@ class Backdrop:
 def build_backdrop(
     room: Room, T_world_cam: Array, intrinsics: Intrinsics, *, is_draft: bool = False
 ) -> Backdrop:
-    """Render the standing room as a camera at T_world_cam (4, 4) sees it; a draft without anti-aliasing."""
+    """Render the static room from a camera at T_world_cam (4, 4); a draft without anti-aliasing."""
     shape = (intrinsics.height_px, intrinsics.width_px)
     origin = T_world_cam[:3, 3]
     corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
@@ -187,7 +187,7 @@ def beside_changes(changes_down: NDArray[np.bool_], changes_across: NDArray[np.b
 
 
 def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Array]:
-    """Compute the radiance, linear (N, 3), and range (N,), m, that rays (N, 3) see of the standing room.
+    """Compute the radiance, linear (N, 3), and range (N,), m, of the static room along rays (N, 3).
 
     Pieces that fit the cache and the memory are rendered one after the other.
     """

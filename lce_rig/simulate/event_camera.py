@@ -31,7 +31,7 @@ class EventPixels(NamedTuple):
     """The differences between pixels, fixed for a sensor.
 
     Attributes:
-        width_px, height_px: of the sensor.
+        width_px, height_px: size of the sensor.
         threshold_on, threshold_off: (P,) by row-major pixel.
         hot_hz: (P,) spontaneous events per second.
     """
@@ -65,11 +65,11 @@ class _Raw:
 
 
 class EventCamera:
-    """An event camera: takes the scene's intensities in order of time and returns events.
+    """An event camera: converts the scene's intensities, in order of time, to events.
 
     Args:
         pixels: the sensor.
-        noise: its errors.
+        noise: the sensor's errors.
         radiance: (H, W) linear intensity at the start, to which the pixels have settled.
         start_ns: when that is, on the rig's clock.
         rng: source of noise.

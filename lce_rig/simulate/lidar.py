@@ -1,4 +1,4 @@
-"""A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and the errors of real ones."""
+"""A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and realistic errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Returns:
 
 
 def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Find the return of each beam; only a beam whose footprint may touch several surfaces is split.
+    """Find the return of each beam; only beams whose footprint may hit several surfaces are split.
 
     Args:
         scene: the surfaces.
@@ -94,7 +94,7 @@ def _touches_several(
 
 
 def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Blend a footprint's echoes closer together than the pulse; of the groups left, report the strongest."""
+    """Blend a footprint's echoes closer together than the pulse; report the strongest remaining one."""
     n, k = len(origins), len(_CELLS)
     sub_origins, sub_directions = _sub_rays(origins, directions, _CELLS, noise)
     flat_origins, flat_directions = sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3)
@@ -175,15 +175,15 @@ class LidarModel:
     For a LiDAR without rings, each firing of a scan is a laser of its own.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         elevations_rad: (L,) of each laser, in firing order.
         azimuths_rad: (L,) of each laser from the rotor's.
         vertical_offsets_m: (L,) height of each laser's optical centre.
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
         starts_ns: (L,) when each laser fires after the first of its sequence.
         sequence_ns: time between two sequences.
-        period_ns: of one revolution, or of the scans that are accumulated.
-        pattern: as of the data sheet.
+        period_ns: duration of one revolution, or of the scans that are accumulated.
+        pattern: as in the data sheet.
     """
 
     name: str
@@ -238,7 +238,7 @@ class Sweep(NamedTuple):
         laser: (N,) of each firing, in firing order.
         offset_ns: (N,) after the first firing.
         azimuth_rad: (N,).
-        returns: of each firing.
+        returns: returns of each firing.
         is_rim: (N,) whether the beam met the board's border.
     """
 
@@ -259,13 +259,13 @@ def sweep_scene(
     board_at: Callable[[NDArray[np.int64]], Array] | None = None,
     lidar_at: Callable[[NDArray[np.int64]], Array] | None = None,
 ) -> Sweep:
-    """Send the beams of one revolution.
+    """Trace the beams of one revolution.
 
     Args:
         scene: the surfaces that the beams meet.
         T_world_lidar: (4, 4).
         model: the LiDAR's geometry and timing.
-        noise: its errors.
+        noise: the sensor's errors.
         rng: source of the azimuth phase.
         stamp_ns: device time of the first firing.
         board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.

@@ -50,14 +50,14 @@ class LiveScene:
         self._show(between(start, end, share), is_held=False)
 
     def can_be_held(self, camera: str, T_world_board: Array) -> bool:
-        """Return whether a pose (4, 4) is free of obstacles, and enough rings of the LiDAR hit the board."""
+        """Check whether a pose (4, 4) is free of obstacles, and enough rings of the LiDAR hit the board."""
         view = next(view for view in self.stage.views if view.camera == camera)
         stage = self.stage
         is_free = view.can_be_held(stage.board, stage.room, T_world_board)
         return is_free and view.count_rings(stage.board, T_world_board) >= stage.rig.quality.min_rings
 
     def take(self, stamp_ns: int) -> Iterator[Image | Scan]:
-        """Take a scan of each LiDAR that begins at a time, and an image of each camera at its middle."""
+        """Take a scan of each LiDAR that starts at a time, and an image of each camera at mid-scan."""
         period_ns = max(model.period_ns for model in self.stage.models.values())
         yield from self.take_images(stamp_ns + period_ns // 2)
         yield from self.take_scans(stamp_ns)

@@ -162,10 +162,10 @@ class SimulationOptions:
         mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
         motion: whether the board is held still or moved by hand; only a moving one makes events.
-        hand: its movement.
+        hand: movement of the person's hand.
         events: errors of cameras with a channel of events; their optics are `camera`'s.
         events_span_s: time that a capture's events cover before and after a scan's timestamp.
-        exposure_s: of a moving board's images.
+        exposure_s: exposure time of a moving board's images.
         frame_every_s: between the images of a camera that runs freely while the board moves.
         frame_offset_s, event_offset_s: lead of the timestamps of images and of events over the LiDAR's clock,
             which is the rig's.

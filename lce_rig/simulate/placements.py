@@ -41,7 +41,7 @@ class CameraView:
     T_world_lidar: Array
 
     def is_in_image(self, board: Board, T_world_board: Array) -> bool:
-        """Return whether the camera sees the whole pattern, or the whole plate of a plain one."""
+        """Check whether the camera sees the whole pattern, or the whole plate of a plain one."""
         pattern = board.outline() if board.type == "plain" else board.corners()
         middle = pattern.mean(axis=0)
         # The outer squares reach one square beyond the inner corners.
@@ -55,14 +55,14 @@ class CameraView:
         return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
 
     def can_be_held(self, board: Board, room: Room, T_world_board: Array) -> bool:
-        """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
+        """Check whether a person can hold the board there, completely visible to camera and LiDAR."""
         return self.is_in_image(board, T_world_board) and self.stands_free(board, room, T_world_board)
 
     def stands_free(self, board: Board, room: Room, T_world_board: Array) -> bool:
-        """Return whether a person can hold the board there, with nothing before it."""
+        """Check whether a person can hold the board there, with nothing in front of it."""
         centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
         if abs(normal[2]) > 0.7:
-            return False  # no person holds a board flat
+            return False  # people do not hold a board horizontally
         to_lidar = self.T_world_lidar[:3, 3] - centre
         if normal @ to_lidar < 0.45 * np.linalg.norm(to_lidar):
             return False
@@ -107,7 +107,7 @@ class CameraView:
         return int(np.sum(returns >= _RETURNS_PER_RING))
 
     def _is_in_view(self, board: Board, T_world_board: Array) -> bool:
-        """Return whether the plate lies within the pattern of a LiDAR without rings."""
+        """Check whether the plate lies within the pattern of a LiDAR without rings."""
         outline = transform(invert(self.T_world_lidar) @ T_world_board, 1.1 * board.outline())
         azimuth, elevation = (
             np.arctan2(outline[:, 1], outline[:, 0]),
@@ -137,7 +137,7 @@ def place_board(
         board: the board.
         room: the board and its carrier must stand free in it.
         options: ranges of distance and roll.
-        index: of the capture; consecutive ones fill the image evenly.
+        index: index of the capture; consecutive ones fill the image evenly.
         rng: source of the tilt and of the next candidates.
         start: (3,) start of the session's even filling, 0..1.
 
@@ -227,7 +227,7 @@ class Trajectory:
 
     @property
     def is_still(self) -> bool:
-        """Whether the board is at one pose for ever."""
+        """Whether the board stays at one pose."""
         return len(self.arrival_ns) == 1 and not len(self.frequency_hz)
 
     def at(self, t_ns: int | NDArray[np.int64]) -> Array:
@@ -271,7 +271,7 @@ def between(start: Array, end: Array, share: float | Array) -> Array:
 
 
 def hold_board(T_world_board: Array) -> Trajectory:
-    """Keep the board at one pose for ever."""
+    """Keep the board permanently at one pose."""
     zero = np.zeros(1, dtype=np.int64)
     none = np.zeros((0, 6))
     return Trajectory(zero, zero, T_world_board[None], np.zeros(0), none, none, np.zeros(6))

@@ -1,4 +1,4 @@
-"""The room around the rig, with objects that must not be mistaken for the board, and the board's carrier."""
+"""The room around the rig, with decoys for the board detection, and the board's carrier."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class Room:
 
     Attributes:
         T_world_room: (4, 4); world has the LiDAR's heading, z up, origin on the floor below the LiDAR.
-        raycaster: of all surfaces.
+        raycaster: ray caster of all surfaces.
         lamps: (P, 3) m, world.
         low, high: (3,) corners, m, frame room.
         obstacles: (low, high) of objects in it, m, frame room.
@@ -176,7 +176,7 @@ def _backwards(T_world_board: Array) -> Array:
 
 
 def _clearance(bodies: Array, board: Board, T_world_board: Array, gap_m: float) -> float:
-    """Find how far bodies must move backwards so that all they have near the plate lies `gap_m` behind it.
+    """Compute how far bodies must move backwards so that their parts near the plate are `gap_m` behind it.
 
     Args:
         bodies: (N, 3) points all over them, m, world.

@@ -76,7 +76,7 @@ class StagedBoard:
         return Scene(stage.room.raycaster, carrier, stage.board, T_world_board)
 
     def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
-        """Expose an image about a time: the mean of the views while the shutter is open."""
+        """Expose an image around a time: the mean of the views while the shutter is open."""
         stage, options = self.stage, self.stage.options
         backdrop = stage.backdrops[camera]
         smear_px = options.exposure_s * speed_px_s(self.trajectory, stage.board, backdrop, exposed_ns)
@@ -138,7 +138,7 @@ class SimulatedCapture:
     """One capture with its truth.
 
     Attributes:
-        index: of the capture in its session.
+        index: index of the capture in its session.
         images: one a camera that has a channel of frames, in the profile's order.
         scans: one a LiDAR, in the profile's order.
         T_lidar_board: true (4, 4) by LiDAR, at its scan's timestamp.
@@ -176,12 +176,12 @@ def simulate_captures(
     Args:
         rig: the profile.
         n_captures: how many; the first ones do not depend on this number.
-        seed: of truth, room, placements and noise.
+        seed: random seed of truth, room, placements and noise.
         options: `SimulationOptions.for_rig` of the rig by default.
 
     Raises:
         ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.
-        LceRigError: no place for the board is seen by the camera and the LiDAR.
+        LceRigError: no placement of the board is visible to the camera and the LiDAR.
     """
     stage = set_stage(rig, seed, options)
     options = stage.options
@@ -203,11 +203,11 @@ def simulate_captures(
 def capture_at(
     stage: Stage, index: int, T_world_board: Array, rng: np.random.Generator | None = None
 ) -> SimulatedCapture:
-    """Take one capture of a board that is held still at a given place.
+    """Take one capture of a still board at a given placement.
 
     Args:
         stage: the session, see `set_stage`.
-        index: of the capture; its noise and its timestamp follow from it.
+        index: index of the capture; its noise and its timestamp follow from it.
         T_world_board: (4, 4).
         rng: source of the carrier's appearance; follows from the index by default.
     """
@@ -273,7 +273,7 @@ def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOption
 
 
 def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
-    """Find the mean firing time of a scan's board returns; half a scan after its timestamp without any.
+    """Return the mean firing time of a scan's board returns; mid-scan without any.
 
     Each return is compared with the board's pose at that return's own time.
     """
@@ -334,19 +334,19 @@ def stamp_of(sample: Image | Scan | Events) -> int:
 def simulate_recording(
     rig: Rig, *, duration_s: float, seed: int, options: SimulationOptions | None = None
 ) -> SimulatedRecording:
-    """Set up a recording; iterating over it simulates it, and gives the same bytes each time.
+    """Set up a recording that is simulated while iterated over; the same arguments give the same bytes.
 
-    The board passes the placements that `simulate_captures` of this seed would show, from one to the next.
+    The board moves from one placement to the next; they are those of `simulate_captures` with this seed.
 
     Args:
         rig: the profile.
-        duration_s: of the recording.
-        seed: of truth, room, placements and noise.
+        duration_s: duration of the recording.
+        seed: random seed of truth, room, placements and noise.
         options: `SimulationOptions.for_rig` of the rig by default; the board always moves.
 
     Raises:
         ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.
-        LceRigError: no place for the board is seen by the camera and the LiDAR.
+        LceRigError: no placement of the board is visible to the camera and the LiDAR.
     """
     options = replace(options or SimulationOptions.for_rig(rig.name), motion="moving")
     stage = set_stage(rig, seed, options)

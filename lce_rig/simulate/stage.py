@@ -1,4 +1,4 @@
-"""The constants of a simulated session: the room, the sensors' true poses and their own errors."""
+"""The constants of a simulated session: the room, the sensors' true poses and errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -39,14 +39,14 @@ class Stage:
 
     Attributes:
         rig: the profile.
-        seed: of the session.
+        seed: random seed of the session.
         options: content and errors of the session.
         board: the profile's board.
         room: the static objects around them.
         T_world_sensor: (4, 4) of each camera and LiDAR.
         backdrops: each simulated camera's image of the room.
-        models: of each LiDAR.
-        noise: its errors.
+        models: models of each LiDAR.
+        noise: the sensor's errors.
         laser_bias_m: (L,) range offset of each laser of each LiDAR.
         pixels: those of each camera with a channel of events.
         views: pairs of sensors that the board is placed for in turn.
@@ -71,7 +71,7 @@ class Stage:
         return [name for name in self.backdrops if self.rig.cameras[name].first_channel("frames")]
 
     def rng(self, *stream: int) -> np.random.Generator:
-        """Begin a stream of random numbers of this session or of one of its captures."""
+        """Start a stream of random numbers of this session or of one of its captures."""
         return np.random.default_rng([self.seed, *stream])
 
     def measure(self, lidar: str, sweep: Sweep, rng: np.random.Generator, stamp_ns: int) -> Scan:
@@ -111,7 +111,7 @@ def truth_extrinsics(
 
     Args:
         rig: the profile.
-        seed: of the session.
+        seed: random seed of the session.
         options: `SimulationOptions.for_rig` of the rig by default.
     """
     options = options or SimulationOptions.for_rig(rig.name)
@@ -129,7 +129,7 @@ def set_stage(
 
     Args:
         rig: the profile.
-        seed: of the session.
+        seed: random seed of the session.
         options: `SimulationOptions.for_rig` of the rig by default.
         is_draft: whether to render the room without anti-aliasing, in two thirds of the time.
 

@@ -57,12 +57,12 @@ class ClockModel:
         return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, origin)
 
     def convert(self, source_ns: int) -> int:
-        """Read the reference's clock at a moment of the source's (1)."""
+        """Convert a time of the source's clock to the reference's (1)."""
         elapsed_ns = source_ns - self.anchor_ns
         return self.reference_ns + elapsed_ns + round(self.drift * elapsed_ns)
 
     def convert_all(self, source_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Read the reference's clock at moments (N,) of the source's (1)."""
+        """Convert times (N,) of the source's clock to the reference's (1)."""
         elapsed_ns = np.asarray(source_ns, dtype=np.int64) - self.anchor_ns
         drifted_ns = np.rint(self.drift * elapsed_ns).astype(np.int64)
         return np.asarray(self.reference_ns + elapsed_ns + drifted_ns)

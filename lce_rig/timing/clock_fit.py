@@ -14,14 +14,14 @@ from lce_rig.core.geometry import Array
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 MIN_PAIRS = 4
-# A timestamp in whole microseconds cannot scatter by less.
+# Minimum scatter of a timestamp in whole microseconds.
 _FLOOR_NS = 1000.0 / np.sqrt(12)
 _N_ROUNDS = 10
 _N_STRETCHES = 8
 _MIN_INLIERS = 3
 _MAX_PAIRS = 2048
 _N_WITNESSES = 3
-# Least step that counts as a jump, in standard deviations of the readings and, even with exact ones, in ns.
+# Minimum step that counts as a jump, in standard deviations of the readings and, for exact ones, in ns.
 _STEP_SIGMAS, _MIN_STEP_NS = 8.0, 200_000.0
 # Length of the fitted window: drift changes with temperature, so older readings are dropped.
 _WINDOW_NS = 60 * NS_PER_S
@@ -94,7 +94,7 @@ def match_edges(
         source_ns: (N,) edges on the one clock; rising.
         reference_ns: (M,) edges on the other; rising, more than twice the tolerance apart.
         coarse: from the one clock to the other, right to within the tolerance.
-        tolerance_ns: how far off it may be.
+        tolerance_ns: largest accepted deviation.
 
     Returns:
         The edges (K,) on both clocks that are nearest to each other both ways and within the tolerance.
@@ -116,7 +116,7 @@ def nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class LineFit:
-    """Readings in the order of time, and the line
+    """Readings in the order of time, and the fitted line.
 
         y_i = offset + drift x_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)                              (1)
         sigma_i^2 = (e_0^2 + e_i^2) / 3,      e_0 the tenth part quantile of e                             (2)
@@ -244,7 +244,7 @@ class ClockTracker:
     """
 
     def __init__(self, what: str) -> None:
-        """Begin without readings; the argument describes them in words: "time requests"."""
+        """Start without readings; the argument names them in messages: "time requests"."""
         self.steps: list[ClockStep] = []
         self._what = what
         self._pairs: deque[_Pair] = deque(maxlen=_MAX_PAIRS)
@@ -253,7 +253,7 @@ class ClockTracker:
         self._n_new = 0
 
     def add(self, source_ns: int, reference_ns: int, bound_ns: float = 0.0) -> None:
-        """Take a reading of both clocks, and record a jump if it proves one.
+        """Add a reading of both clocks, and record a jump if it proves one.
 
         Args:
             source_ns: on the source's clock.
@@ -286,7 +286,7 @@ class ClockTracker:
         return self._latest(max_new=1)
 
     def restart(self) -> None:
-        """Forget all readings: the device restarted."""
+        """Discard all readings after a restart of the device."""
         self._pairs.clear()
         self._suspects.clear()
         self._model = None

@@ -33,7 +33,7 @@ SLOW_TRIGGERS_HZ = 4.0
 _COARSE_EDGE_NS = 100_000_000.0
 # Error of a locked VLP-16, which counts whole microseconds.
 _LOCKED_SIGMA_NS = 1_000.0
-# Speed of a board that is carried in haste.
+# Speed of a board carried in haste.
 BOARD_SPEED_MPS = 1.0
 
 
@@ -54,7 +54,7 @@ class SyncVerdict(NamedTuple):
 
 
 class EdgeClock:
-    """The board's time on a sensor's clock, fitted to the board's pulses and the edges that the sensor saw.
+    """The board's time on a sensor's clock, fitted to the board's pulses and the sensor's edges.
 
     A DAVIS346 timestamps the edges at its trigger input without numbers. Edges are matched to pulses by a
     coarse model of its clock and, once a fit exists, by the fit.
@@ -64,10 +64,10 @@ class EdgeClock:
     """
 
     def __init__(self, sensor: str, coarse_error_ns: float) -> None:
-        """Begin without a model.
+        """Start without a model.
 
         Args:
-            sensor: its name in the profile.
+            sensor: the sensor's name in the profile.
             coarse_error_ns: largest error of the coarse model.
         """
         self.problem: Finding | None = findings.NO_EDGES(sensor)
@@ -79,23 +79,23 @@ class EdgeClock:
         self._seen_ns: deque[int] = deque(maxlen=_N_EDGES)
 
     def set_clock(self, board_from_sensor: ClockModel) -> None:
-        """Take a coarse model: for a sensor that stamps the computer's time, the board's own inverted."""
+        """Set a coarse model: for a sensor with the computer's time, the board's own inverted."""
         self._coarse = board_from_sensor
 
     def take_sent(self, pulse: Pulse) -> None:
-        """Take a pulse as the board sent it."""
+        """Add a pulse sent by the board."""
         if self._sent_ns and pulse.stamp_ns < self._sent_ns[-1]:
             self.restart()
         self._sent_ns.append(pulse.stamp_ns)
 
     def take_seen(self, pulse: Pulse) -> None:
-        """Take an edge as the sensor saw it."""
+        """Add an edge detected by the sensor."""
         if self._seen_ns and pulse.stamp_ns < self._seen_ns[-1]:
             self.restart()
         self._seen_ns.append(pulse.stamp_ns)
 
     def restart(self) -> None:
-        """Forget all edges: a clock was set, or the board restarted."""
+        """Discard all edges after a clock change or restart."""
         self._sent_ns.clear()
         self._seen_ns.clear()
         self._model = None
@@ -139,7 +139,7 @@ class RigClock:
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:
-        """Begin without models.
+        """Start without models.
 
         Args:
             rig: the profile, with the sensors and their trigger lines.
@@ -172,7 +172,7 @@ class RigClock:
         return any(matcher.problem is not None for matcher in self._quick)
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
-        """Take a sample of a source, and return those whose time is now known, on the rig's clock."""
+        """Add a sample of a source; return the samples with a known time, on the rig's clock."""
         if isinstance(sample, Pulse):
             return self._take_pulse(source, sample)
         matcher = self._matchers.get(sample.sensor)
@@ -181,7 +181,7 @@ class RigClock:
             matched = matcher.take_image(sample)
             if was_matching:
                 return [self._at_pulse(each.image, each.stamp_ns) for each in matched]
-            # Until pulses are matched, the computer's clock must do.
+            # Until pulses are matched, use the computer's clock.
         return [self.place(sample)]
 
     def place(self, sample: Sample) -> Sample:
@@ -196,7 +196,7 @@ class RigClock:
     def refresh(
         self, host_clock: ClockModel | None, utc_clock: ClockModel | None, locked: Collection[str]
     ) -> None:
-        """Take new models.
+        """Set new models.
 
         Args:
             host_clock, utc_clock: the computer's time and UTC on the board's clock; None where unknown.

@@ -1,4 +1,4 @@
-"""The rig's time, common to all sensors, and frames: a scan with the images and events of its time."""
+"""The rig's time, common to all sensors, and frames: a scan with its images and events."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
-    """Name a camera's channel of kind events; None without one."""
+    """Return a camera's events channel; None without one."""
     return rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
 
 
@@ -131,7 +131,7 @@ class EventBuffer:
                 packets.popleft()
 
     def clear(self) -> None:
-        """Forget everything: the clocks were set."""
+        """Discard everything after a clock change."""
         self._streams.clear()
 
     def has_passed(self, time_ns: int) -> bool:

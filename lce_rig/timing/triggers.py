@@ -1,4 +1,4 @@
-"""Triggered images and the pulses that made them, matched by their running numbers.
+"""Triggered images and their pulses, matched by sequence number.
 
 A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, found from the
 times of a few images at the start. From then on images are matched by number only, so that a busy computer or
@@ -32,7 +32,7 @@ _MAX_STEPS = 8
 
 
 class TriggeredImage(NamedTuple):
-    """An image and the pulse that made it.
+    """An image and the pulse that triggered it.
 
     Attributes:
         image: as the camera gave it.
@@ -54,7 +54,7 @@ class _Waiting(NamedTuple):
 
 
 class TriggerMatcher:
-    """Pulses and images of one camera in, matched images out, each stream in its own order.
+    """Matches one camera's images to pulses; each stream keeps its own order.
 
     Attributes:
         counts: n_matched images and n_unmatched ones; n_restarts of either count, or of the search for the
@@ -66,7 +66,7 @@ class TriggerMatcher:
         """Prepare to find the constant.
 
         Args:
-            camera: its name in the profile.
+            camera: the camera's name in the profile.
             max_delay_ns: latest timestamp of an image after its pulse, on the board's clock.
         """
         self.counts = Counter[str]()
@@ -89,7 +89,7 @@ class TriggerMatcher:
         self._clock = board_from_camera
 
     def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
-        """Take a pulse, and return the images that waited for it."""
+        """Add a pulse, and return the images that waited for it."""
         last_count, last_ns = next(reversed(self._pulses.items()), (pulse.count - 1, 0))
         if pulse.count <= last_count:
             if self._pulses.get(pulse.count) == pulse.stamp_ns:
@@ -97,7 +97,7 @@ class TriggerMatcher:
             self._restart(findings.RESTARTED)
             self._pulses.clear()
         elif (n_steps := pulse.count - last_count) <= _MAX_STEPS:
-            # Pulses whose lines were lost lie between their neighbours.
+            # Interpolate pulses with lost lines between their neighbours.
             step_ns = (pulse.stamp_ns - last_ns) / n_steps
             self._pulses |= {last_count + k: last_ns + round(k * step_ns) for k in range(1, n_steps)}
         self._pulses[pulse.count] = pulse.stamp_ns
@@ -106,7 +106,7 @@ class TriggerMatcher:
         return list(self._proceed())
 
     def take_image(self, image: Image) -> list[TriggeredImage]:
-        """Take an image, and return those whose pulses are now known."""
+        """Add an image, and return those with known pulses."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self.counts["n_unmatched"] += 1
             is_numbered = image.count is not None
@@ -140,10 +140,10 @@ class TriggerMatcher:
                 yield from self._follow(self._waiting.popleft(), self._constant)
 
     def _seek(self, frame: _Waiting) -> Iterator[TriggeredImage]:
-        """Look for the constant: the same for several images in a row, each with one possible pulse."""
+        """Search for the constant: the same for several successive images with one possible pulse each."""
         window_ns = self._max_delay_ns
         possible = [n for n, ns in self._pulses.items() if 0 <= frame.board_ns - ns <= window_ns]
-        # If a pulse was lost on the way, another one may look like the only candidate.
+        # If a pulse line was lost, another pulse may look like the only candidate.
         is_ambiguous = len(possible) > 1 or self._period_ns() < window_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:

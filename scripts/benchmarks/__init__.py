@@ -1,1 +1,1 @@
-"""What docs/benchmarks.md claims, measured: one module a table."""
+"""Benchmarks behind docs/benchmarks.md, one module per table."""

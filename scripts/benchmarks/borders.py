@@ -1,4 +1,4 @@
-"""Boards whose border is hidden, smeared or merges with a stand, simulated: boards used, truth of claims."""
+"""Simulated boards with a hidden, smeared or merged border: boards used, and coverage of covariances."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -36,7 +36,7 @@ cameras:
 """
 _NOISE_M = 0.008
 _OS1_DEG = np.linspace(-16.6, 16.6, 64)
-# Standard deviation of the pose beyond which a board says nothing of it, m and rad.
+# Standard deviation of the pose above which a board has no information, m and rad.
 _OPEN = 1.0
 _PRIORS = Priors(shift_m=1e-3, lateral_m=1e-6, vertical_m=1e-6)
 
@@ -53,7 +53,7 @@ def _vlp_16(shapes: list[Shape], seed: int) -> Scan:
 
 
 def _os1_64(shapes: list[Shape], seed: int) -> Scan:
-    # Lasers of four columns, whose angles are no multiples of a step.
+    # Lasers of four columns, with angles that are not multiples of a step.
     return cast(
         shapes, sigma_m=_NOISE_M, seed=seed, elevations_deg=_OS1_DEG, step_deg=360 / 1024, stagger=0.27
     )

@@ -1,4 +1,4 @@
-"""Corruptions of the boards that were detected, where those of samples would have to be simulated anew.
+"""Corruptions of detected boards, for cases that would otherwise need new simulated samples.
 
 Each takes the profile, the sound detections and the session's T_cam_lidar (4, 4).
 """

@@ -1,4 +1,4 @@
-"""Random halves of sound sessions: what is said against them is false."""
+"""Random halves of uncorrupted sessions: any finding against them is false."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -38,7 +38,7 @@ class Draws:
 
 
 def draw_halves(samples: Samples, method: Method, n_draws: int, found: Detections) -> Draws:
-    """Calibrate random halves of a sound session.
+    """Calibrate random halves of an uncorrupted session.
 
     Args:
         samples: the session.

@@ -56,7 +56,7 @@ class Corruption:
     spoil: Spoil | None = None
 
     def is_beyond(self, rig: Rig) -> bool:
-        """Tell whether it is larger than the sound profile allows for."""
+        """Check whether the corruption is larger than the uncorrupted profile allows for."""
         try:
             return self.sigmas is None or self.sigmas(rig) > _BEYOND
         except ZeroDivisionError:
@@ -114,7 +114,7 @@ def _cycled(samples: Samples, names: Sequence[str]) -> Samples:
 
 
 def _dealt(samples: Samples, sources: Sequence[str]) -> Samples:
-    """Give every capture the image of another; stamps are those of the scans it is put beside."""
+    """Exchange the captures' images; timestamps are those of the scans they are paired with."""
     images = {
         name: replace(samples.images[source], stamp_ns=samples.images[name].stamp_ns)
         if source != name
@@ -220,7 +220,7 @@ def _elevations() -> Iterator[Corruption]:
             lambda s, angle=angle: _with_other_table(s, angle),  # type: ignore[misc]
             causes.LASERS,
         )
-    # Whoever reads such a point cloud counts its rings from the lowest.
+    # Readers of such a point cloud count its rings from the lowest.
     yield Corruption("elevations in reversed order", _upside_down, causes.MIRRORED | causes.LASERS)
 
 
@@ -261,7 +261,7 @@ def _with_angles(samples: Samples, errors: Callable[[Array], tuple[Array, Array]
     return replace(samples, scans={name: raised(scan) for name, scan in samples.scans.items()})
 
 
-# Captures of a rig whose sensors sit elsewhere.
+# Captures of a rig with other sensor poses.
 
 
 def _other_places() -> Iterator[Corruption]:
@@ -294,7 +294,7 @@ def _other_places() -> Iterator[Corruption]:
         ("5 cm", _aside(0.05)),
         ("0.8 deg and 15 mm", _NUDGE),
     ):
-        # Where the LiDAR stands in the end counts.
+        # The LiDAR's final pose is the truth.
         yield Corruption(
             f"LiDAR nudged by {label} half-way",
             lambda s, T=T: replace(  # type: ignore[misc]
@@ -311,7 +311,7 @@ def _other_places() -> Iterator[Corruption]:
 
 
 def _at_the_ends() -> Iterator[Corruption]:
-    """Move the LiDAR before the last captures, or after the first: where it stands in the end counts."""
+    """Move the LiDAR before the last captures, or after the first; its final pose is the truth."""
     for angle_deg in (1.5, 3.0, 5.0):
         T = _about_x(angle_deg)
         for n in (1, 2, 3, 4):
@@ -347,7 +347,7 @@ def _drifting() -> Iterator[Corruption]:
 
 
 def _drifted(samples: Samples, angle_deg: float) -> Samples:
-    """Turn the LiDAR about z, in proportion to the captures' numbers; where it stands in the end counts."""
+    """Rotate the LiDAR about z in proportion to the capture number; its final pose is the truth."""
     names, scans = samples.captures, dict(samples.scans)
     for name, part in zip(names, np.linspace(0, 1, len(names)), strict=True):
         scans[name] = _nudged(samples, [name], _about_z(angle_deg * float(part))).scans[name]
@@ -566,7 +566,7 @@ def _with_mixed_stamps(samples: Samples) -> Samples | None:
     return replace(samples, images=images)
 
 
-# Noise, and captures that tell too little.
+# Noise, and captures with too little information.
 
 
 def _noise() -> Iterator[Corruption]:
@@ -638,7 +638,7 @@ def _copied(samples: Samples) -> Samples:
     )
 
 
-# What all of them are made of.
+# The uncorrupted data from which all are made.
 
 
 def _same(samples: Samples) -> Samples:

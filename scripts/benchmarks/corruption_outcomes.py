@@ -64,7 +64,7 @@ class Outcome:
 
     @property
     def is_far_off(self) -> bool:
-        """Whether it is beyond what the profile asks for as well."""
+        """Whether it also exceeds the profile's target."""
         return self.is_wrong and self.in_targets > _WRONG
 
     @property
@@ -84,14 +84,14 @@ class Outcome:
 
     @property
     def second_causes(self) -> tuple[str, ...]:
-        """Codes of false causes beside the first."""
+        """Codes of false causes other than the first."""
         return tuple(code for code in self.false_causes if code != self.cause)
 
 
 def judged(rig: Rig, blank: Outcome, calibration: Calibration, truth: Array) -> Outcome:
     """Complete an outcome by a calibration and the true T_cam_lidar (4, 4)."""
     error_deg, error_mm = compare(calibration.T_cam_lidar, truth)
-    # The truth is a pose alone, whatever the intrinsics.
+    # The truth is only a pose, without intrinsics.
     sigma_deg, sigma_m = sigma_sizes(covariance_alone(calibration))
     sigma_mm = 1000 * sigma_m
     return replace(
@@ -148,7 +148,7 @@ def print_summary(outcomes: Sequence[Outcome]) -> None:
 
 
 def print_causes(outcomes: Sequence[Outcome]) -> None:
-    """Count by method how often the first cause is right, and list the others and what is said of sound ones.
+    """Count by method how often the first cause is right; list other causes, and false findings.
 
     Args:
         outcomes: of all sessions, sound ones too.
@@ -211,7 +211,7 @@ def measure_causes(outcomes: Sequence[Outcome]) -> None:
 
 
 def share(marks: Iterable[bool]) -> str:
-    """Count those that are so, with their percentage; "-" of none."""
+    """Format the number of true values with their percentage; "-" without any."""
     held = list(marks)
     return f"{sum(held)} ({100 * sum(held) / len(held):.0f} %)" if held else "-"
 

@@ -1,4 +1,4 @@
-"""Whole sessions for the study of corruptions: images, scans and profile, simulated or recorded by others.
+"""Whole sessions for the study of corruptions: images, scans and profile, simulated or recorded.
 
 What is corrupted here are the samples themselves, so that detectors have their say as well.
 """
@@ -36,19 +36,19 @@ LATE_S = (0.02, 0.05, 0.1, 0.3)
 _PARALLEL, _ONE_PLACE = 90, 91
 # Captures of boards that are placed otherwise have noise of their own.
 _FIRST_PARALLEL, _FIRST_IN_ONE_PLACE = 1000, 2000
-# Lenses that are approximate or do not fit, and ranges that are too long, by those who published them.
+# Recordings with approximate or unfit intrinsics, or with long ranges, as published.
 _FAULTS: Mapping[str, Codes] = {
     "os1_gen1": RANGE_OFFSET,
     "vlp16_tilted": LENS,
     "vlp32c_left": LENS,
     "vlp32c_right": LENS,
 }
-# How still somebody holds the board who never moves it on purpose.
+# Motion of a board held as still as possible by hand.
 _JITTER_M, _JITTER_RAD = 0.01, np.radians(1.0)
 
 
 def rig_with_drawing(name: str) -> Rig:
-    """Load a shipped profile as of a user who has a CAD model: it holds the nominal extrinsics."""
+    """Load a shipped profile and add nominal extrinsics, as if from a CAD model."""
     rig = load_rig(name)
     drawn = tuple(entry.model_copy(update={"source": "cad"}) for entry in rig.nominal_extrinsics)
     return rig.model_copy(update={"nominal_extrinsics": drawn})
@@ -104,7 +104,7 @@ def late(offset_s: float) -> str:
 
 
 def simulated_samples(rig_name: str, seed: int = SEED, n_captures: int = N_CAPTURES) -> Samples:
-    """Simulate a session of boards held still, and its variants.
+    """Simulate a session of still boards, and its variants.
 
     Args:
         rig_name: of a shipped profile with one camera and one LiDAR.

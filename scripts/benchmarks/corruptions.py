@@ -1,4 +1,4 @@
-"""Study of corruptions: what the verdict says of sessions that are wrong as a whole, against their error."""
+"""Study of corruptions: the verdict on corrupted sessions, compared with their actual error."""
 
 import os
 import sys
@@ -112,7 +112,7 @@ def judge_session(
         try:
             corrupted = kind.corrupt(samples)
         except LceRigError as error:
-            # The corrupted profile is none: that is what a user would be told.
+            # The corrupted profile is invalid: a user would get this error.
             yield [refused(_blank(samples.rig, samples, kind, method), error) for method in methods]
             continue
         if corrupted is not None:
@@ -176,14 +176,14 @@ def _judge(
     except LceRigError as error:
         return refused(blank, error)
     except Exception as error:
-        # A study of hours goes on after a fault of the program, and names it as the cause.
+        # A study of hours continues after a program fault, and records it as the cause.
         traceback.print_exc()
         return replace(blank, cause=type(error).__name__, reason=str(error))
     return judged(samples.rig, blank, calibration, T_cam_lidar @ samples.T_lidar_moved)
 
 
 def _blank(sound: Rig, samples: Samples, kind: Corruption, method: Method) -> Outcome:
-    """Start an outcome with what is known before the calibration."""
+    """Start an outcome with the figures known before the calibration."""
     what = samples.name, kind.name, method, kind.unobservable, "refused", ""
     return Outcome(*what, expected=kind.causes, faults=samples.faults, is_beyond=kind.is_beyond(sound))
 

@@ -36,7 +36,7 @@ CHOICES: tuple[tuple[str, ...], ...] = (("frames",), ("events",), ("events", "fr
 
 @dataclass(frozen=True)
 class ChannelRun:
-    """What one choice of channels gave in one session."""
+    """Result of one choice of channels in one session."""
 
     deg: float
     mm: float
@@ -47,7 +47,7 @@ class ChannelRun:
 
 @dataclass
 class SessionRun:
-    """What one simulated session gave: errors by choice of channels, and corners by channel."""
+    """Results of one simulated session: errors by choice of channels, and corners by channel."""
 
     runs: dict[str, ChannelRun] = field(default_factory=dict)
     corner_px: dict[str, list[float]] = field(default_factory=dict)
@@ -151,7 +151,7 @@ def _assess(
 def _corner_errors(
     rig: Rig, channel: str, found: Mapping[str, ImageDetection], captures: dict[str, SimulatedCapture]
 ) -> Iterator[float]:
-    """Give the rms corner error of each picture in which the board was found, px for each coordinate."""
+    """Return the rms corner error of each image with a detected board, px per coordinate."""
     intrinsics, corners = rig.cameras[CAMERA].to_intrinsics(), rig.board.to_board().corners()
     offset_s = FRAME_OFFSET_S if channel == "frames" else EVENT_OFFSET_S
     for name, board in found.items():

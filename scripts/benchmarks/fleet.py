@@ -72,7 +72,7 @@ def rows_of(registry: Path) -> list[dict[str, Any]]:
 
 
 def bench_sessions(folder: Path) -> None:
-    """500 sessions of 60 robots. It continues where it was stopped."""
+    """Run a fleet of 500 sessions of 60 robots; a stopped run is resumed."""
     root, registry = folder / "fleet", folder / "registry"
     make_fleet(root, folder / "captures")
     summary, took_s, cpu_s = run_cli(root, registry, "--workers", "2")
@@ -95,7 +95,7 @@ def bench_sessions(folder: Path) -> None:
 
 
 def compare_with_truth(root: Path, registry: Path) -> None:
-    """Which robots the report names, with which date, beside those that were nudged."""
+    """Compare the robots and dates of the reported movements with the simulated ones."""
     truth: dict[str, Any] = json.loads((root / TRUTH).read_text())
     history = history_of(Registry(Storage.at(registry)).read_table(MOVED_COLUMNS))
     named = {robot for robot, state in history.robots.items() if state == "moved"}

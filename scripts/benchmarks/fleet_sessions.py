@@ -28,7 +28,7 @@ from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrins
 
 N_ROBOTS, N_SESSIONS, N_NUDGED = 60, 500, 12
 _CAPTURES = 8
-# Of one mounting: for as many sessions as the robot with most has.
+# Captures of one mounting, enough for the robot with the most sessions.
 _MOST = -(-N_SESSIONS // N_ROBOTS) * _CAPTURES
 _MOUNTINGS = 2
 _FIRST_DATE = datetime(2026, 1, 5, 9, tzinfo=timezone.utc)
@@ -179,7 +179,7 @@ def _simulate_pool(pool: tuple[Path, int, Nudge | None, int]) -> None:
 
 
 def compose(path: Path, rig: Rig, robot: str, pool: Path, chosen: list[int], date: datetime) -> None:
-    """Write a session of captures of another one, whose files it shares, at another date."""
+    """Write a session with the captures of another one, sharing its files, at another date."""
     lidar, camera = rig.lidars["lidar"], rig.cameras["cam"]
     own = rig.model_copy(
         update={

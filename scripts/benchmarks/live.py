@@ -74,7 +74,7 @@ class Load:
 
 
 def bench_live(duration_s: float) -> None:
-    """Collect under load, and tabulate what was lost, how fast guidance and captures were, and their cost."""
+    """Collect under load; tabulate losses, the speed of guidance and captures, and their cost."""
     with tempfile.TemporaryDirectory() as folder:
         rig = load_of_sensors()
         reel = make_reel(Path(folder) / "reel", rig, N_PLACEMENTS)
@@ -103,7 +103,7 @@ def load_of_sensors() -> Rig:
 def run_load(
     folder: Path, rig: Rig, reel: Reel, duration_s: float, *, has_frames: bool, has_board: bool = False
 ) -> Load:
-    """Start the senders, and collect in a process of its own."""
+    """Start the senders, and collect in a separate process."""
     camera_report = folder / "camera.json"
     with ExitStack() as stack:
         if has_board:

@@ -4,7 +4,7 @@ import re
 
 Value = float | int | str
 
-#: What this run measured: values and unit by key.
+#: Measurements of this run: values and unit by key.
 MEASURED: dict[str, tuple[list[Value], str]] = {}
 DEG_MM = "{:.3f} deg, {:.1f} mm"
 _DIGITS = 6

@@ -24,14 +24,14 @@ FOLDER = Path("build/offline")
 _RIG, _SEED = "rlfs", 0
 _START_NS = 1_700_000_000_000_000_000
 _SCAN_NS, _IMAGES_PER_SCAN = 100_000_000, 3
-#: How long the board is held, is on its way, and is out of sight after every third placement.
+#: Time for which the board is held, is moved, and is out of sight after every third placement, s.
 _HELD_SCANS, _WALK_SCANS, _AWAY_SCANS, _PLACES_PER_ROUND = 20, 15, 15, 3
 #: Out of every sensor's sight.
 _DOWN_M = 1000.0
 
 
 def bench_offline(duration_s: float) -> None:
-    """Tabulate how long `collect --from` takes, and what it captured.
+    """Tabulate the duration of `collect --from`, and its captures.
 
     Args:
         duration_s: of the bag, which is simulated first and kept.

@@ -42,7 +42,7 @@ def paper_noise(level: int) -> LidarNoise:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """One board as both sensors saw it.
+    """One board in both sensors.
 
     Attributes:
         image: in the picture.
@@ -71,7 +71,7 @@ def paper_rig() -> Rig:
 
 
 def paper_set(folder: Path, seed: int, n_captures: int = N_CAPTURES) -> PaperSet:
-    """Simulate a set and detect its boards, or read what was detected before.
+    """Simulate a set and detect its boards, or read stored detections.
 
     Args:
         folder: where detections are kept.
@@ -96,7 +96,7 @@ class _Maker:
 
     def __init__(self, seed: int) -> None:
         self._seed, self.rig = seed, paper_rig()
-        # Any level: what the beams meet is the same for all.
+        # The noise level does not matter: beams hit the same surfaces at all levels.
         self._options = replace(SimulationOptions.for_rig("sss"), lidar=paper_noise(LEVELS[0]))
         self.T_cam_lidar = truth_extrinsics(self.rig, seed, self._options)[CAMERA, LIDAR]
 

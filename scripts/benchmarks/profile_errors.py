@@ -1,4 +1,4 @@
-"""Simulated sessions whose lens, board and ranges differ from the profile as its standard deviations say."""
+"""Simulated sessions with errors of lens, board and ranges drawn from the profile's standard deviations."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
 
-# A stream of random numbers of its own.
+# A separate stream of random numbers.
 _STREAM = 3
 
 

@@ -16,7 +16,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.reach import as_used
+from lce_rig.judge.reach import equivalent_extrinsics
 from lce_rig.judge.repeatability import compare_calibrations
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
@@ -165,9 +165,9 @@ def _halves(
 
 
 def _apart(first: Calibration, second: Calibration) -> tuple[tuple[float, float], float]:
-    """Compare two results as they draw points: their difference, and how far apart they place boards, mm."""
+    """Compare two results by projected points: their difference, and the distance between boards, mm."""
     lens = first.intrinsics
-    T = [c.T_cam_lidar if lens is None else as_used(c, lens) for c in (first, second)]
+    T = [c.T_cam_lidar if lens is None else equivalent_extrinsics(c, lens) for c in (first, second)]
     boards = [o.lidar.T_lidar_board[:3, 3] for c in (first, second) for o in c.observations.values()]
     moved = transform(T[0], np.array(boards)) - transform(T[1], np.array(boards))
     rms_m = np.sqrt(np.mean(np.sum(moved**2, axis=1)))

@@ -19,7 +19,7 @@ RIGS = Path(__file__).resolve().parents[2] / "tests" / "rigs"
 
 @dataclass(frozen=True)
 class RecordedSet:
-    """Folders of recordings, the profile that fits them, and the channels whose pictures they hold."""
+    """Folders of recordings, their profiles, and the channels of their images."""
 
     name: str
     rig: str

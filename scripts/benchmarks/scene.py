@@ -75,7 +75,7 @@ class _Watched:
         ]
 
     def scene(self, views: list[OutlineView], deployed: Calibration) -> SceneDrift:
-        """Judge a result by the scene alone, without what moves in it."""
+        """Judge a result by the scene alone, without moving objects."""
         return watch_scene(without_movers(views), self.rig.lens_of(deployed), deployed)
 
     def drift(self, views: list[OutlineView], deployed: Calibration) -> PairDrift:
@@ -93,7 +93,7 @@ def _samples(session: Session, c: Calibration) -> list[Seen]:
     return [Seen(s.name, s.image(c.camera, "frames"), s.scan(c.lidar), None) for s in session.captures]
 
 
-# Five captures, and what they are judged against.
+# Five captures, and the result they are compared with.
 _Part = tuple[_Watched, list[OutlineView]]
 
 

@@ -33,7 +33,7 @@ _FAR_M = 0.04
 
 
 def bench_sessions() -> None:
-    """Print what moved in the recordings RLFS01 to RLFS03, by days."""
+    """Print the sensors that moved between the recordings RLFS01 to RLFS03, by day."""
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     edges: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     prints: dict[str, list[Array]] = defaultdict(list)
@@ -102,7 +102,7 @@ def _row(name: str, points: Array, edges: dict[str, list[float]], prints: Array)
 
 
 def edge_offsets(lidar: LidarBoard, T_lidar_board: Array, board: Board) -> dict[str, float]:
-    """Measure how far ring ends lie outside the plate's upper and lower edges, as the image has it, m."""
+    """Compute how far ring ends lie outside the plate's upper and lower edges in the image's pose, m."""
     ends = transform(invert(T_lidar_board), lidar.edge_points)
     points, normals = board.edges()
     outside = np.einsum("kei,ki->ke", ends[None] - points[:, None], normals)

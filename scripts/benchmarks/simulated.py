@@ -1,4 +1,4 @@
-"""The simulated rig with boards held still: errors against exact truth over many seeds."""
+"""The simulated rig with still boards: errors against exact truth over many seeds."""
 
 from collections.abc import Iterator
 

@@ -20,7 +20,7 @@ from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.finder import BoardFinder
 
-# Key, what was measured, unit, value.
+# Key, description, unit and value of each measurement.
 _Measured = Iterator[tuple[str, str, str, float]]
 _MS = "{:.1f} ms"
 

@@ -144,13 +144,13 @@ def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) 
 
 
 def scan_held_board(stage: Stage, T_world_board: Array, rng: np.random.Generator, index: int) -> Scan:
-    """Scan a board that is held still at (4, 4); rng decides what its carrier looks like."""
+    """Scan a still board at (4, 4); rng determines the carrier's appearance."""
     board = StagedBoard(stage, hold_board(T_world_board), rng)
     return board.take_scan(stage.views[0].lidar, _STAMP_NS + index * 4_000_000_000, (index,))
 
 
 def with_small_pictures(rig: Rig) -> Rig:
-    """Shrink a rig's pictures, for sessions that render none."""
+    """Reduce a rig's image size, for sessions without rendering."""
     cameras = {}
     for name, camera in rig.cameras.items():
         lens = camera.intrinsics

@@ -38,21 +38,21 @@ from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
 
 CORNER_SIGMA_PX = 0.1
-# Something found in the scan that lies farther than this from the board is not it.
+# Largest distance of a candidate in the scan from the board; farther ones are other objects.
 _FOUND_M = 0.05
 _FREEDOMS = 6
 # Of a normal distribution.
 _THREE_SIGMAS = 0.9973
-# Distance of the point whose error in the image is tabulated.
+# Distance of the point with the tabulated image error.
 _POINT_M = 10.0
 _DISPLACEMENT = SHIFTS[-2:]
-# Logarithms of simulated levels lie so near to those of recordings.
+# Scatter of the logarithms of simulated levels about those of recordings.
 _WITHIN = 1.5
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is simulated: a rig, perhaps with another LiDAR, and how it errs beyond the defaults.
+    """A simulated rig, perhaps with another LiDAR, and its errors beyond the defaults.
 
     Levels are those of errors that the corners of one image share.
     """
@@ -190,7 +190,7 @@ def _cells(runs: list[BoundedRun]) -> Iterator[str]:
 
 
 def _claim_cells(runs: Sequence[Run]) -> Iterator[str]:
-    """Say how large the errors are, how large the reported ones, NEES with its interval, and coverage."""
+    """Print the actual and the reported errors, NEES with its interval, and coverage."""
     deg, mm = _rms(runs)
     claimed_deg, claimed_mm = _sizes(np.mean([run.cov for run in runs], axis=0))
     nees = np.array([nees_of(run) for run in runs])
@@ -245,7 +245,7 @@ def _runs_of_lidars(n_seeds: int, n_captures: int) -> Iterator[Run]:
 def _runs_in_error(
     case: Case, method: Method, n_seeds: int, folder: Path, n_captures: int
 ) -> Iterator[JudgedRun]:
-    """Calibrate sessions as a user would, with profiles whose lens, board and ranges are off."""
+    """Calibrate sessions with profiles whose lens, board and ranges are wrong."""
     rig = load_rig(case.rig)
     for seed in range(n_seeds):
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
@@ -259,7 +259,7 @@ def _runs_in_error(
 
 
 def error_in_use(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> Array:
-    """Measure the error (6,) of extrinsics used with their intrinsics, whose errors turn them back."""
+    """Compute the error (6,) of extrinsics used with their intrinsics, whose errors compensate rotations."""
     assert calibration.intrinsics is not None
     model = model_of(lens)
     wrong = model.vector(calibration.intrinsics) - model.vector(lens)
@@ -331,7 +331,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
 
 
 def is_board(session: StillSession, item: Observation) -> bool:
-    """Tell whether what was found in the scan lies where the board truly was."""
+    """Check whether the candidate in the scan is at the board's true position."""
     T = invert(session.T_cam_lidar) @ session.T_cam_board[item.capture]
     return float(np.linalg.norm(item.lidar.points.mean(axis=0) - T[:3, 3])) < _FOUND_M
 
@@ -347,7 +347,7 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
         for name in ("rows", "step_m", "range_m", "is_backed")
     )
 
-    # A displacement of all ring ends is the truth's to tell: none.
+    # The truth has no displacement common to all ring ends.
     by_width_mm = rows[:, END["shifts"]][:, : -len(_DISPLACEMENT)] / 1e3
     n = by_width_mm.shape[1]
 

@@ -1,4 +1,4 @@
-"""Sessions calibrated with a profile whose focal length, principal point or squares are wrong."""
+"""Sessions calibrated with a profile with a wrong focal length, principal point or square size."""
 
 from collections import Counter
 from pathlib import Path

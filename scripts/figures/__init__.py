@@ -1,1 +1,1 @@
-"""The pictures of the documentation, made with lce-rig itself."""
+"""The images of the documentation, made with lce-rig itself."""

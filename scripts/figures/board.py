@@ -108,7 +108,7 @@ def _draw_rings(axes: Any, rig: Rig) -> None:
     turn = Affine2D().rotate_deg(45)
     outline = turn.transform(1000 * board.outline()[:, :2])
     reach = 1000 * max(board.width_m, board.height_m) * 0.78
-    # A VLP-16's rings lie 2 deg apart: 70 mm at 2 m.
+    # A VLP-16's rings are 2 deg apart: 70 mm at 2 m.
     for y in range(-7 * 70 + 35, 8 * 70, 70):
         crossings = _crossings(outline, y)
         if len(crossings) == 2:

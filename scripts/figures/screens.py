@@ -83,7 +83,7 @@ def draw_screens(folder: Path, n_captures: int = 4) -> None:
 
 
 class _Terminal(threading.Thread):
-    """Reads what a program writes, so that it never waits, into a screen."""
+    """Reads a program's output into a screen, so that the program never waits."""
 
     def __init__(self, line: int) -> None:
         super().__init__(daemon=True)
@@ -139,7 +139,7 @@ def _cell(cell: Any) -> str:
         "font-weight": "bold" if cell.bold else "",
     }
     style = ";".join(f"{key}:{value}" for key, value in parts.items() if value)
-    # Each in a box of its own: characters of other fonts may be wider.
+    # Each in a separate box: characters of other fonts may be wider.
     return f'<i style="{style}">{html.escape(cell.data) or " "}</i>'
 
 

@@ -1,4 +1,4 @@
-"""Simulated captures: how to hold the board, and what a good and a bad result look like."""
+"""Simulated captures: how to hold the board, and examples of good and bad results."""
 
 import textwrap
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ def stage_of(rig: Rig, carrier: Any = "person") -> Stage:
 
 
 def draw_placements(rig: Rig, places: Sequence[Placement], columns: int = 3) -> Any:
-    """Draw each placement as `verify` does, with what the tool says where it refuses it."""
+    """Draw each placement as `verify` does, with the message if it is refused."""
     stage, finder = stage_of(rig), BoardFinder(rig)
     rows = -(-len(places) // columns)
     figure, grid = plt.subplots(rows, columns, figsize=(3.6 * columns, 2.6 * rows), squeeze=False)

@@ -91,7 +91,7 @@ class _Robot:
 
 
 class _Reader:
-    """A robot that reads the current set all the time; what it finds is kept."""
+    """A robot that reads the current set continuously and stores what it reads."""
 
     def __init__(self, robot: _Robot) -> None:
         self.wrong: list[str] = []
@@ -117,7 +117,7 @@ class _Reader:
 
 
 def fuzz_deploy_kills(n: int, seed: int) -> DeployKillReport:
-    """Kill deployments n times at each kind of place, at any moment and about the swap.
+    """Kill deployments n times per kind of target, at random moments and around the swap.
 
     Args:
         n: kills into a folder, and as many over ssh.
@@ -229,7 +229,7 @@ def _kill_once(
 
 
 def _undisturbed(session: Path, robot: _Robot, report: DeployKillReport) -> Iterator[str]:
-    """Deploy to the end, which clears what was left; then go back, byte for byte."""
+    """Complete a deployment, which removes remains of killed ones; then roll back, byte for byte."""
     before = robot.sets.index(_settled(robot))
     process = _deploy(session, robot, 1 - before)
     if process.wait(PATIENCE_S) != 0:
@@ -247,7 +247,7 @@ def _undisturbed(session: Path, robot: _Robot, report: DeployKillReport) -> Iter
 
 
 def _settled(robot: _Robot) -> Content:
-    """Read the current set once a last step that goes on without its program has been taken."""
+    """Read the current set once a last step that outlives its program is done."""
     time.sleep(1.0)
     return _current(robot.folder)
 
@@ -265,7 +265,7 @@ def _named(found: Content) -> str:
 
 
 def _left(folder: Path) -> list[str]:
-    """List what a deployment that ended does not leave: releases that never were current."""
+    """List remains of a completed deployment: releases that were never current."""
     current = (folder / "current").resolve().name
     releases = [path.parent for path in folder.glob(f"releases/*/{RECORD}")]
     return [path.name for path in releases if path.name != current and not (path / USED).exists()]

@@ -18,7 +18,7 @@ from lce_rig.rig import load_rig
 BOMB_BYTES = 5_100_000_000
 _BLOCK = bytes(1 << 24)
 _SPARSE_BYTES = 100 << 30
-# Of whole pairs beside a bad file.
+# Number of valid pairs beside a bad file.
 N_NEIGHBOURS = 3
 
 Make = Callable[[Path, Path], list[str]]
@@ -48,7 +48,7 @@ def _collect(folder: Path, whole: Path, path: Path) -> list[str]:
 
 
 def beside(name: str, write: Callable[[Path], None]) -> Make:
-    """Put one bad file, with a whole partner, beside whole pairs."""
+    """Put one bad file with a valid partner beside valid pairs."""
 
     def make(folder: Path, whole: Path) -> list[str]:
         recording = _pairs(folder, whole)
@@ -101,7 +101,7 @@ def zeros(path: Path) -> None:
 
 
 def pipe(path: Path) -> None:
-    """Make a named pipe that nobody writes to."""
+    """Create a named pipe without a writer."""
     os.mkfifo(path)
 
 
@@ -151,7 +151,7 @@ def _jpeg() -> bytes:
 
 
 def _tiff() -> bytes:
-    """Write a TIFF image of 8,000 x 8,000 px whose one strip claims 3 GB."""
+    """Write a TIFF image of 8,000 x 8,000 px with a strip of a stated size of 3 GB."""
     entries = [(256, 4, 8000), (257, 4, 8000), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8),
                (277, 3, 1), (278, 4, 8000), (279, 4, 3_000_000_000)]  # fmt: skip
     rows = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
@@ -222,7 +222,7 @@ def _mcap_bomb(kind: str) -> Callable[[Path], None]:
 
 
 def _ros1_bomb(kind: str) -> Callable[[Path], None]:
-    """Write a ROS 1 bag of images, compressed, whose chunk unpacks to 5.1 GB."""
+    """Write a compressed ROS 1 bag of images with a chunk that unpacks to 5.1 GB."""
 
     def write(path: Path) -> None:
         from rosbags.rosbag1 import Writer

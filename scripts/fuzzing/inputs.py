@@ -18,7 +18,7 @@ from fuzzing.report import Report
 from fuzzing.started import said, start
 
 MOST_S, MOST_MB = 5.0, 500.0
-# Above what is asked, so that the excess is measured; the computer must live.
+# Above the permitted limit, so that the excess is measured; the computer must survive.
 _STOP_S, _STOP_BYTES = 60.0, 3_500_000_000
 _BUG = 70
 # Time between two readings of a process's memory.
@@ -27,7 +27,7 @@ _POLL_S = 0.01
 
 @dataclass
 class InputReport(Report):
-    """What became of the inputs.
+    """Outcome of the inputs.
 
     Attributes:
         longest_s, largest_mb: of all.
@@ -41,7 +41,7 @@ class InputReport(Report):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of one command.
+    """Outcome of one command.
 
     Attributes:
         code: its exit code; negative by a signal.
@@ -95,7 +95,7 @@ def _peak_mb(pid: int) -> float:
 
 
 def fuzz_inputs(n: int, seed: int) -> InputReport:
-    """Give n inputs to the program, each in a process of its own; at most all, in random order."""
+    """Run the program on n inputs, each in a separate process; at most all, in random order."""
     report, began_s = InputReport(), time.monotonic()
     names = list(HOSTILE)
     random.Random(seed).shuffle(names)

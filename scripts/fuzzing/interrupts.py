@@ -130,7 +130,7 @@ def _run(*words: object) -> None:
 
 
 def _measure(bench: _Bench, verb: str) -> float:
-    """Run a verb to its end, and say how long it took after its beginning."""
+    """Run a command to its end, and return the duration after its start."""
     process = _start(_VERBS[verb](bench))
     began_s = time.monotonic()
     try:
@@ -204,5 +204,5 @@ def _press(process: "subprocess.Popen[str]", *, to_all: bool) -> None:
 
 
 def _is_one_line(said: str) -> bool:
-    """Tell whether it said that it was interrupted, once; notes of before may precede."""
+    """Check that the interrupt was reported exactly once; earlier notes may precede."""
     return said.strip().endswith(_SAID) and said.count(_SAID) == 1

@@ -1,4 +1,4 @@
-"""`lce-rig collect` killed again and again while it captures: what is listed is whole, and nothing lost."""
+"""Kill `lce-rig collect` repeatedly while it captures: listed captures are complete, none is lost."""
 
 import random
 import re
@@ -81,7 +81,7 @@ def _kill_once(profile: Path, session: Path, chance: random.Random, *, is_at_cap
 
 
 def _check(session: Path, safe: set[str]) -> list[str]:
-    """Read the newest captures, and find what is missing."""
+    """Read the newest captures, and find missing ones."""
     opened = Session.open(session)
     captures = opened.captures
     wrong = [f"{name} was said to be safe and is gone" for name in safe - {each.name for each in captures}]

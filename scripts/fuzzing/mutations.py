@@ -77,7 +77,7 @@ distortion
 
 @dataclass
 class MutationReport(Report):
-    """What became of the damaged files.
+    """Outcome of the damaged files.
 
     Attributes:
         longest_s, largest_mb: of all commands.
@@ -211,7 +211,7 @@ def make_sound(folder: Path) -> None:
 
 
 def import_all() -> None:
-    """Import what the commands would import, once for all children."""
+    """Import the commands' modules once for all children."""
     for parent in (lce_rig.cli, lce_rig.io):
         for module in pkgutil.walk_packages(parent.__path__, f"{parent.__name__}."):
             importlib.import_module(module.name)
@@ -243,7 +243,7 @@ def run_forked(words: list[str]) -> Outcome:
 
 
 def fuzz_mutations(n: int, seed: int) -> MutationReport:
-    """Give n damaged files to the program, kind by kind; each from its own random numbers."""
+    """Run the program on n damaged files of each kind, with separate random numbers."""
     report = MutationReport()
     with tempfile.TemporaryDirectory() as folder:
         sound, place = Path(folder) / "sound", Path(folder) / "place"

@@ -29,7 +29,7 @@ _N_CAPTURES = 8
 _SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 _REPORT = "report.html"
 _EVERY = 6
-# Ctrl-C ends a verb in words; whatever came too late finds it done.
+# Ctrl-C ends a command with a message; a late one finds it finished.
 _MAX_STOP_S = 2.0
 
 Content = Mapping[str, str]
@@ -38,7 +38,7 @@ Content = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Verb:
-    """A command and what it leaves.
+    """A command and its outputs.
 
     Attributes:
         folder: that it replaces, in the session.
@@ -94,7 +94,7 @@ class _Known:
     swap_s: dict[str, float] = field(default_factory=dict)
 
     def variant_of(self, content: Content) -> int | None:
-        """Tell of which run a result is; one that was killed later has no report yet."""
+        """Return the run that a result belongs to; one killed later has no report yet."""
         for variant, result in enumerate(self.results):
             if content in (result, {name: file for name, file in result.items() if name != _REPORT}):
                 return variant
@@ -134,7 +134,7 @@ def fuzz_result_kills(n: int, seed: int) -> ResultKillReport:
 
 
 def check(session: Path, known: _Known) -> list[str]:
-    """Find what is not whole in a session's folders of results."""
+    """Find incomplete results in a session's folders."""
     wrong = []
     folder = session / "calibration"
     found = _own_content(folder)
@@ -168,7 +168,7 @@ def _own_content(folder: Path) -> Content:
 
 
 def _misread(session: Path, folder: Path) -> list[str]:
-    """Read the result as a program would, and write its exports anew: those on the disk must be the same."""
+    """Read the result as a program would, and write its exports again: they must equal those on the disk."""
     try:
         saved = read_result(folder / "result.json")
         with tempfile.TemporaryDirectory() as own:
@@ -189,7 +189,7 @@ def _misread(session: Path, folder: Path) -> list[str]:
 
 
 def _describe(found: Content, wanted: list[Content]) -> str:
-    """Say in which files a folder differs from the nearest that was expected."""
+    """List the files in which a folder differs from the nearest expected one."""
     nearest = min(wanted, key=lambda each: len(set(each.items()) ^ set(found.items())))
     names = sorted({name for name, _ in set(nearest.items()) ^ set(found.items())})
     return ", ".join(f"{name} ({'missing' if name not in found else 'other'})" for name in names[:8])
@@ -264,7 +264,7 @@ def _kill_once(
 
 
 def _run_undisturbed(session: Path, chance: random.Random, known: _Known) -> Iterator[str]:
-    """Run all three verbs to their end: they must work, and clear what was left behind."""
+    """Run all three commands to their end: they must succeed and remove remains."""
     variant = chance.randrange(2)
     for name in VERBS:
         process = start(_words(session, name, variant))
@@ -279,7 +279,7 @@ def _run_undisturbed(session: Path, chance: random.Random, known: _Known) -> Ite
 
 
 def _drafts(session: Path) -> list[str]:
-    """List hidden folders and files beside the session's own."""
+    """List hidden folders and files beside the session's regular ones."""
     return sorted(
         str(entry.relative_to(session))
         for entry in session.rglob(".*")

@@ -75,7 +75,7 @@ def test_association_of_some_mirrored_lists_captures(captures, side):
         ("reversed", list(range(N))[::-1]),
     ],
 )
-def test_association_of_other_order_names_it(captures, order, sources):
+def test_association_of_reordered_captures_names_order(captures, order, sources):
     error = error_in(dealt(captures, sources))
     assert (error.code, error.figures["order"]) == ("association.other_order", order)
     assert error.figures["n_explained"] >= N - 2
@@ -88,7 +88,7 @@ def test_association_of_two_exchanged_images_is_a_note(captures):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_association_of_sound_captures_is_none(seed):
+def test_association_of_matching_captures_is_none(seed):
     narrow = Scenario(tilt_deg=(0.0, 10.0), distance_m=(2.0, 2.5))
     assert error_in(simulate(N, seed=seed)) is None
     assert error_in(simulate(N, seed=seed, scenario=narrow)) is None
@@ -123,7 +123,7 @@ def test_calibrate_of_some_mirrored_names_it_first(captures):
     assert calibration.verdict != "pass"
 
 
-def test_calibrate_of_few_alike_captures_names_disagreement(captures):
+def test_calibrate_few_consistent_captures_reports_disagreement(captures):
     alike = [replace(captures[0], capture=f"a{k}") for k in range(4)]
     wrong = [replace(item, surface=somewhere_else(k)) for k, item in enumerate(captures[:7])]
     with pytest.raises(NotEnoughDataError) as caught:

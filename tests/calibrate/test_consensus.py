@@ -85,7 +85,7 @@ def test_consensus_swapped_pose_is_corrected():
         np.testing.assert_array_equal(chosen[item.capture], item.image.T_cam_board)
 
 
-def test_captures_that_agree_with_nothing_have_no_consensus():
+def test_consensus_of_unrelated_captures_is_empty():
     captures = [replace(item, surface=somewhere_else(k)) for k, item in enumerate(simulate(4, seed=6))]
     with pytest.raises(NotEnoughDataError) as caught:
         find_consensus(captures, BOARD)

@@ -46,7 +46,7 @@ def test_fit_motions_rates_match_covariance():
     assert np.mean(nees) < 6 * 1.5
 
 
-def test_points_of_a_moving_board_come_back_onto_one_plane():
+def test_deskewed_points_lie_on_one_plane():
     rng = np.random.default_rng(5)
     quiet = Scenario(range_sigma_m=0.0)
     T_cam_board = random_pose(rng, quiet, BOARD)
@@ -84,7 +84,7 @@ def test_motion_time_offsets_are_found_to_ms(followed):
 
 
 @pytest.mark.long
-def test_time_offsets_are_found_from_two_pictures_a_capture():
+def test_time_offsets_are_found_from_two_images_per_capture():
     moving = Moving()
     results = [
         estimate_extrinsics(simulate_moving(20, s, moving), BOARD, OPTIONS, Clocks()) for s in range(2)
@@ -103,7 +103,7 @@ def test_motion_compensation_halves_error(followed):
     assert np.all(rms < [0.07, 2.5])
 
 
-def test_the_extrinsics_covariance_covers_boards_that_moved(followed):
+def test_extrinsics_covariance_covers_moving_boards(followed):
     nees = []
     for _, result in followed:
         off = difference(result.T_cam_lidar, T_FORWARD)
@@ -118,7 +118,7 @@ def test_corner_noise_is_estimated_by_channel(followed):
     assert noise_px["events"] == pytest.approx(0.2, rel=0.05)
 
 
-def test_a_channel_that_is_followed_is_compensated_alone():
+def test_tracked_channel_alone_is_compensated():
     captures = {"events": simulate_moving(25, 1, TRACKED)["events"]}
     result = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     (events,) = result.channels
@@ -162,7 +162,7 @@ def test_motion_single_channel_is_unchanged():
     assert result.channel_difference is None
 
 
-def test_motion_upside_down_image_is_turned(followed):
+def test_motion_upside_down_image_is_rotated(followed):
     captures, right = followed[0]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     flipped = [

@@ -28,13 +28,13 @@ def test_quadratics_grouped_nees_is_near_3():
     assert 2.3 < nees.mean() < 3.5  # 3 expected
 
 
-def test_few_groups_are_not_trusted_too_far():
+def test_few_groups_covariance_is_not_too_small():
     errors, covariances = sample_regressions(n_groups=7, n_trials=800)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     assert np.median(nees) < 2.37  # the median of chi square with 3 degrees
 
 
-def test_moves_match_leave_one_group_out():
+def test_leave_one_out_shifts_match_refits():
     rng = np.random.default_rng(1)
     group = np.array([0, 0, 1, 2, 2, 2, 3])
     A, b = rng.normal(size=(7, 5, 3)), rng.normal(size=(7, 5))

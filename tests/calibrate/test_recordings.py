@@ -60,7 +60,7 @@ def detect(folder, rig):
         ("rles01_le", "rles", 33, 1.0, 0.040),
     ],
 )
-def test_the_extrinsic_is_near_the_reference(recordings, recording, profile, n_captures, max_deg, max_m):
+def test_recording_extrinsics_are_near_reference(recordings, recording, profile, n_captures, max_deg, max_m):
     rig = load_rig(profile)
     estimate = fit_extrinsic(detect(recordings / recording, rig), rig.board.to_board())
     reference = np.array(json.loads((recordings / recording / "reference.json").read_text())["T_cam_lidar"])

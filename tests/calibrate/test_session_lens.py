@@ -61,7 +61,7 @@ def test_session_lens_rarely_contradicts(captures):
     assert contradicted <= 3
 
 
-def test_an_exact_profile_stays_as_it_is(captures):
+def test_exact_profile_is_unchanged(captures):
     lens = fit_session_lens(images(captures), BOARD, EXACT)
     model = lens.estimate.model
     np.testing.assert_allclose(model.vector(lens.intrinsics), model.vector(CAMERA), rtol=1e-5)
@@ -72,7 +72,7 @@ def test_an_exact_profile_stays_as_it_is(captures):
         np.testing.assert_allclose(new.image.cov, old.image.cov, rtol=0.02, atol=1e-12)
 
 
-def test_the_lidar_does_not_move_the_lens(captures):
+def test_session_lens_ignores_lidar(captures):
     turned = perturb(np.eye(4), np.array([0, 0, 0, 0, 0, np.radians(0.2)]))
     moved = [
         replace(

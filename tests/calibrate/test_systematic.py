@@ -32,7 +32,7 @@ def normalised_errors(options, n_seeds):
 
 @pytest.mark.long
 @pytest.mark.parametrize("n_seeds", [12, pytest.param(40, marks=pytest.mark.slow)])
-def test_range_errors_of_known_size_are_in_the_covariance(n_seeds):
+def test_known_range_errors_are_in_covariance(n_seeds):
     nees = normalised_errors(
         replace(NO_DRAWS, laser_bias_sigma_m=LASER_SIGMA_M, range_offset_sigma_m=OFFSET_SIGMA_M), n_seeds
     )

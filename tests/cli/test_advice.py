@@ -93,20 +93,20 @@ def _actions():
                 yield kind.code, action
 
 
-def test_an_action_takes_one_line_of_a_terminal():
+def test_action_fits_one_terminal_line():
     for code, action in _actions():
         # Indented by "    -> "; a figure takes about four characters.
         filled = re.sub(r"{[^}]*}", "1.23", action.replace("{session}", "session"))
         assert len(filled) <= 80 - 7, (code, action)
 
 
-def test_an_option_in_an_action_is_part_of_a_whole_command():
+def test_action_option_is_part_of_a_command():
     for code, action in _actions():
         assert " --" not in f" {_QUOTED.sub('', action)}", (code, action)
 
 
 @pytest.mark.parametrize(("place", "command"), ADVISED)
-def test_an_advised_command_can_be_typed(place, command):
+def test_advised_command_parses(place, command):
     assert _lacking(command) == ""
 
 
@@ -214,7 +214,7 @@ def workbench():
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", TYPED, ids=" ".join)
-def test_an_advised_command_works(command, workbench, tmp_path, monkeypatch, lce_rig):
+def test_advised_command_runs(command, workbench, tmp_path, monkeypatch, lce_rig):
     shutil.copytree(workbench, tmp_path, dirs_exist_ok=True, symlinks=True)
     monkeypatch.chdir(tmp_path)
     if command[0] in ("collect", "simulate") or "--save-profile" in command:

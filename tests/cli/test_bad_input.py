@@ -84,7 +84,7 @@ def test_other_resolution_names_both_sizes(lce_rig, session):
     assert "692x520" in outcome.err
 
 
-def test_pictures_without_a_board_say_so(lce_rig, session, tmp_path):
+def test_images_without_board_are_reported(lce_rig, session, tmp_path):
     keep(session, 3)
     source = Session.open(session)
     with Session.create(tmp_path / "empty", source.rig) as writer:
@@ -136,7 +136,7 @@ def test_static_plate_is_not_the_board(tmp_path):
 @pytest.mark.parametrize(
     "changes", [{"file": True}, {"file": "../../../secret.png"}, {"camera": "other"}, {"channel": "none"}]
 )
-def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, changes):
+def test_bad_manifest_refuses_only_its_capture(lce_rig, session, changes):
     keep(session, 3)
     manifest = session / "captures" / "000002" / "meta.json"
     document = json.loads(manifest.read_text())
@@ -158,7 +158,7 @@ def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, change
         "\ufeff{}",
     ],
 )
-def test_a_reference_that_cannot_be_read_is_a_session_error(lce_rig, session, tmp_path, text):
+def test_unreadable_reference_is_session_error(lce_rig, session, tmp_path, text):
     (tmp_path / "ref.json").write_text(text, encoding="utf-8")
     outcome = lce_rig("calibrate", session, "--reference", tmp_path / "ref.json")
     assert outcome.code == 4 and "ref.json" in outcome.err

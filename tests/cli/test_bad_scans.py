@@ -119,7 +119,7 @@ def test_collect_turning_lidar_is_rejected(lce_rig, standing, tmp_path, deg_s, n
 
 @pytest.mark.long
 @pytest.mark.parametrize(("deep_m", "n"), [(0.0, 7), (0.0, 1), (0.1, 7)], ids=["flush", "once", "behind"])
-def test_a_box_that_touches_the_plate_gives_no_wrong_result(lce_rig, spoil, deep_m, n):
+def test_box_touching_plate_gives_no_wrong_result(lce_rig, spoil, deep_m, n):
     """It stands below half of the lower edge of n boards, its face in the plate's plane or a hand behind."""
     rng, n_scans = np.random.default_rng(0), 0
 
@@ -189,7 +189,7 @@ def test_clouds_without_tags_are_used_whole(lce_rig, standing, tmp_path, has_dus
     ("model", "has_nominal", "finding"),
     [("VLP-16", True, "verdict.exchanged"), ("OS1-64", False, "verdict.other_model")],
 )
-def test_lidars_under_each_others_name_fail(lce_rig, tmp_path, model, has_nominal, finding):
+def test_exchanged_lidar_names_fail(lce_rig, tmp_path, model, has_nominal, finding):
     profile = yaml.safe_load(TWO_LIDARS.read_text())
     profile["lidars"]["side"]["model"] = model
     (tmp_path / "lidars.yaml").write_text(yaml.safe_dump(profile))

@@ -21,7 +21,7 @@ from lce_rig.rig.board_settings import board_block
         (["--squares", "9x7", "--size", "0.07"], "8x6,0.07"),
     ],
 )
-def test_the_block_that_it_prints_is_that_of_a_new_profile(lce_rig, tmp_path, words, board):
+def test_board_block_equals_that_of_new_profile(lce_rig, tmp_path, words, board):
     outcome = lce_rig("board", *words, "--plate", "0.8x0.7", "-o", tmp_path / "board.pdf")
     assert outcome.code == 0
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
@@ -51,7 +51,7 @@ def test_the_block_that_it_prints_is_that_of_a_new_profile(lce_rig, tmp_path, wo
         (["--squares", "9x7", "--size", "0.07", "-o", "/nowhere/board.pdf"], 8),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(lce_rig, words, code, tmp_path, monkeypatch):
+def test_board_impossible_pattern_is_refused(lce_rig, words, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert lce_rig("board", *words).code == code
     assert not list(tmp_path.iterdir())

@@ -21,7 +21,7 @@ CODES = sorted(code for code in KINDS if code.startswith(("verdict.", "associati
         max_size=9,
     )
 )
-def test_calibrate_fail_shows_a_reason_that_fails(drawn):
+def test_calibrate_fail_shows_failing_reason(drawn):
     found = [Finding(code, severity, stored=(f"{code} {k}", "")) for k, (code, severity) in enumerate(drawn)]
     judged = with_findings(calibration(), found)
     if judged.verdict != "fail":

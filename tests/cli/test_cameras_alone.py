@@ -49,7 +49,7 @@ def test_images_of_two_cameras_give_a_robot_description(stereo, tmp_path, lce_ri
     assert (tmp_path / "out/camchain.yaml").exists()
 
 
-def test_bag_of_two_cameras_is_cut_where_the_board_stands_still(stereo, tmp_path, lce_rig):
+def test_bag_of_two_cameras_is_captured_at_still_boards(stereo, tmp_path, lce_rig):
     rig = load_rig(stereo / "stereo.yaml")
     with Writer(tmp_path / "drive", version=8) as writer:
         topics = {

@@ -38,13 +38,13 @@ def test_captures_rejected_until_restored(lce_rig, calibrated):
         ("--reject", "0,99"),
     ],
 )
-def test_one_wrong_name_moves_nothing(lce_rig, session, options):
+def test_captures_wrong_name_moves_nothing(lce_rig, session, options):
     outcome = lce_rig("captures", session, *options)
     assert outcome.code == 2
     assert {each["state"] for each in listed(lce_rig, session).values()} == {"kept"}
 
 
-def test_several_captures_are_named_at_once(lce_rig, session):
+def test_captures_accepts_several_names(lce_rig, session):
     assert lce_rig("captures", session, "--reject", "1, 2", "--reject", "4").code == 0
     rejected = {name for name, each in listed(lce_rig, session).items() if each["state"] == "rejected"}
     assert rejected == {"000001", "000002", "000004"}
@@ -52,7 +52,7 @@ def test_several_captures_are_named_at_once(lce_rig, session):
     assert {each["state"] for each in listed(lce_rig, session).values()} == {"kept"}
 
 
-def test_the_list_names_every_capture_and_a_damaged_one(lce_rig, session):
+def test_captures_lists_damaged_ones_too(lce_rig, session):
     (session / "captures" / "000003" / "meta.json").write_text("{")
     outcome = lce_rig("captures", session)
     assert outcome.code == 0

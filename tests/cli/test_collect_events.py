@@ -44,7 +44,7 @@ def collect(lce_rig, folder, session, *names):
         (["lidar.bag"], ["/davis/image_raw", "davis.frames"]),
     ],
 )
-def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, names, said):
+def test_unusable_event_recording_error_has_action(lce_rig, folder, tmp_path, names, said):
     outcome = collect(lce_rig, folder, tmp_path / "s", *names)
     assert outcome.code == 5
     assert all(text in outcome.err for text in said)

@@ -36,7 +36,7 @@ def cameras_held(session):
     return held
 
 
-def test_each_folder_is_read_for_the_camera_named_with_it(lce_rig, folders, tmp_path):
+def test_folders_are_assigned_to_named_cameras(lce_rig, folders, tmp_path):
     words = [
         w
         for p, camera in zip(folders, ("left", "right"), strict=True)
@@ -47,7 +47,7 @@ def test_each_folder_is_read_for_the_camera_named_with_it(lce_rig, folders, tmp_
     assert cameras_held(tmp_path / "session") == [("left", 100), ("right", 101)]
 
 
-def test_one_camera_named_once_is_that_of_all_folders(lce_rig, folders, tmp_path):
+def test_single_camera_name_applies_to_all_folders(lce_rig, folders, tmp_path):
     words = [w for p in folders for w in ("--from", p)]
     assert lce_rig("collect", "--rig", TWO, tmp_path / "session", *words, "--camera", "right").code == 0
     assert cameras_held(tmp_path / "session") == [("right", 100), ("right", 101)]
@@ -88,7 +88,7 @@ def test_a_session_continues_with_its_own_profile(lce_rig, folders, tmp_path):
         ("0.png", "0.pcd"),
     ],
 )
-def test_rigs_new_and_collect_know_the_same_folders(lce_rig, folders, tmp_path, images, clouds):
+def test_rigs_new_and_collect_read_same_folders(lce_rig, folders, tmp_path, images, clouds):
     folder, source = tmp_path / "data", folders[0]
     for name, file in ((images, "img/0.png"), (clouds, "pcd/0.pcd")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

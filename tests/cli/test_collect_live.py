@@ -31,14 +31,14 @@ TWO_LIDARS = str(Path(__file__).parents[1] / "rigs" / "two_lidars.yaml")
         (["--seed", "3"], "--seed"),
     ],
 )
-def test_options_of_the_other_kind_are_refused_by_name(lce_rig, tmp_path, arguments, named):
+def test_options_of_other_source_kind_are_refused(lce_rig, tmp_path, arguments, named):
     result = lce_rig("collect", "--rig", "rles", tmp_path / "session", *arguments)
     assert result.code == 2 and named in result.err
     assert not (tmp_path / "session").exists()
 
 
 @pytest.mark.realtime
-def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path):
+def test_rig_without_devices_error_has_hint(lce_rig, tmp_path):
     result = lce_rig("collect", "--rig", "rlfs", tmp_path / "session", "--plain", "--timeout", "5")
     assert result.code == 5
     assert "lidar" in result.err and "doctor" in result.err

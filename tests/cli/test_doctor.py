@@ -67,7 +67,7 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     assert "warn" in done.out.splitlines()[0]
 
 
-def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
+def test_interrupted_doctor_leaves_no_process(tmp_path):
     rig = make_rig(sync=None)
     with attach(Attached(rig, PIXELS, has_board=False), tmp_path) as reached:
         document = reached.model_dump()

@@ -76,7 +76,7 @@ def test_verify_draws_the_lidar_for_each_channel(lce_rig, moving, tmp_path):
         assert coloured(drawn, (235, 60, 255)) > 300  # magenta: the board in the LiDAR
 
 
-def test_verify_takes_the_channels_that_a_session_has(lce_rig, moving):
+def test_verify_uses_available_channels(lce_rig, moving):
     words = ["verify", moving.parent / "frames", "--result", moving / "calibration" / "result.json"]
     outcome = lce_rig(*words)
     assert outcome.code == 0, outcome.err

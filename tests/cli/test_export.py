@@ -21,7 +21,7 @@ def extrinsics(session):
     return np.array(json.loads((session / "calibration/result.json").read_text())["pairs"][0]["T_cam_lidar"])
 
 
-def test_a_result_is_set_into_the_urdf_of_a_robot(lce_rig, calibrated, tmp_path):
+def test_export_inserts_result_into_robot_urdf(lce_rig, calibrated, tmp_path):
     robot = tmp_path / "robot.urdf"
     robot.write_text(ROBOT)
     before = contents(calibrated)
@@ -46,7 +46,7 @@ def test_formats_are_chosen_and_the_target_is_named(lce_rig, calibrated, tmp_pat
     assert lce_rig("export", calibrated, "--into", tmp_path / "none.urdf").code == 4
 
 
-def test_a_failed_result_does_not_reach_a_robot(lce_rig, calibrated, tmp_path):
+def test_failed_result_is_not_exported(lce_rig, calibrated, tmp_path):
     path, robot = calibrated / "calibration/result.json", tmp_path / "robot.urdf"
     robot.write_text(ROBOT)
     document = json.loads(path.read_text())

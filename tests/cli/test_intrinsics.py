@@ -65,7 +65,7 @@ def test_intrinsics_json_names_a_stale_lens(lce_rig, few):
         (["--model", "brown"], "'brown' is not one of"),
     ],
 )
-def test_what_does_not_exist_is_a_usage_error(lce_rig, few, words, says):
+def test_intrinsics_unknown_name_is_usage_error(lce_rig, few, words, says):
     outcome = lce_rig("intrinsics", few, *words)
     assert outcome.code == 2
     assert says in outcome.err

@@ -55,7 +55,7 @@ def test_everything_fits_into_80_by_24():
         assert wanted in text
 
 
-def test_of_several_cameras_the_picture_says_whose_it_is():
+def test_live_view_labels_image_of_several_cameras():
     (first, *others) = STREAMS
     two = (first._replace(name="left.frames"), first._replace(name="right.frames"), *others[:1])
     drawing = STATE.drawing._replace(camera="right.frames")
@@ -99,7 +99,7 @@ def test_live_view_empty_state_is_drawn():
     assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
 
 
-def test_bell_capture_once_refusal_twice():
+def test_bell_rings_once_for_capture_twice_for_refusal():
     clock = [0.0]
     rung = []
 
@@ -120,7 +120,7 @@ def test_bell_capture_once_refusal_twice():
     assert heard(STATE, is_silent=True) == []
 
 
-def test_the_pages_code_fits_and_holds_its_link():
+def test_qr_code_fits_and_encodes_link():
     import cv2
 
     link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_"
@@ -134,7 +134,7 @@ def test_the_pages_code_fits_and_holds_its_link():
     assert qr_lines("http://127.0.0.1:8765/") == [] == qr_lines("http://localhost:8765/")
 
 
-def test_plain_lines_say_what_changes_once(capsys):
+def test_plain_lines_report_each_change_once(capsys):
     view = PlainView(Bell(is_silent=True))
     moving = STATE._replace(
         phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)

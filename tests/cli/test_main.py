@@ -32,13 +32,13 @@ def test_every_verb_has_help(lce_rig, verb):
     assert f" lce-rig {verb} " in outcome.out.strip().splitlines()[0]
 
 
-def test_a_misspelt_verb_is_met_with_the_nearest_one(lce_rig):
+def test_misspelt_command_suggests_nearest(lce_rig):
     outcome = lce_rig("calibrat")
     assert outcome.code == 2
     assert "'calibrate'." in outcome.err
 
 
-def test_the_version_is_told(lce_rig):
+def test_version_is_printed(lce_rig):
     assert lce_rig("--version").out == f"lce-rig {__version__}\n"
 
 
@@ -49,7 +49,7 @@ def test_an_unknown_rig_exits_with_3_and_names_the_nearest(lce_rig, tmp_path):
 
 
 @pytest.mark.parametrize("verb", ["check", "calibrate", "verify"])
-def test_a_folder_that_is_no_session_exits_with_4(lce_rig, tmp_path, verb):
+def test_folder_without_session_exits_with_4(lce_rig, tmp_path, verb):
     outcome = lce_rig(verb, tmp_path)
     assert outcome.code == 4
     assert str(tmp_path) in outcome.err
@@ -98,7 +98,7 @@ def test_main_interrupt_in_onnx_exits_130(tmp_path):
 @pytest.mark.parametrize(
     "closed", [*(pytest.param(one, marks=pytest.mark.long) for one in ("<&-", ">&-", "2>&-")), "<&- >&- 2>&-"]
 )
-def test_closed_standard_streams_are_no_bug(closed, tmp_path):
+def test_closed_standard_streams_do_not_crash(closed, tmp_path):
     missing = f'collect --rig rles "{tmp_path}/none" --from "{tmp_path}/no"'
     line = f'exec "{sys.executable}" -m lce_rig {missing} {closed}'
     assert subprocess.run(["sh", "-c", line], check=False).returncode == 5

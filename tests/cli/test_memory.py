@@ -13,7 +13,7 @@ sys.exit(run(sys.argv[1:]))
 """
 
 
-def test_a_huge_file_costs_itself_and_no_memory(tmp_path):
+def test_huge_file_is_refused_without_memory(tmp_path):
     with (tmp_path / "huge.raw").open("wb") as file:
         file.truncate(1 << 40)
     words = [sys.executable, "-c", PROGRAM, "reconstruct", tmp_path / "huge.raw", "-o", tmp_path / "out"]

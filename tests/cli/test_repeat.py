@@ -50,7 +50,7 @@ def compared(lce_rig, *sessions, code=0):
     return json.loads(outcome.out)
 
 
-def test_sessions_that_agree_begin_with_a_line_that_says_so(lce_rig, made):
+def test_repeat_agreeing_sessions_start_with_summary(lce_rig, made):
     a = made("monday", [0.001, 0, 0, 0, 0.001, 0])
     b = made("tuesday", [0, 0.002, 0, 0.001, 0, 0])
     c = made("wednesday", [0, 0, -0.002, 0, 0, 0.001])
@@ -78,7 +78,7 @@ def test_repeat_disagreement_exits_with_7(lce_rig, made):
     assert len(document["differences"]) == 3
 
 
-def test_a_session_alone_or_twice_is_a_usage_error(lce_rig, made):
+def test_repeat_single_or_same_session_is_usage_error(lce_rig, made):
     a = made("monday", [0] * 6)
     assert lce_rig("repeat", a).code == 2
     assert lce_rig("repeat").code == 2
@@ -86,7 +86,7 @@ def test_a_session_alone_or_twice_is_a_usage_error(lce_rig, made):
     assert outcome.code == 2
 
 
-def test_a_copy_and_a_picture_in_two_sessions_make_them_one(lce_rig, made, tmp_path):
+def test_repeat_shared_data_makes_sessions_dependent(lce_rig, made, tmp_path):
     paths = {name: made(name, [0] * 6) for name in ("monday", "wednesday")}
     assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
     pixels = np.full((260, 346), 80, np.uint8)
@@ -128,7 +128,7 @@ def test_repeat_no_common_sensor_is_refused(lce_rig, made):
     assert "monday:" in outcome.err and "rear:" in outcome.err
 
 
-def test_a_session_without_a_result_is_named(lce_rig, made):
+def test_repeat_names_session_without_result(lce_rig, made):
     shutil.rmtree(made("unfinished", [0] * 6) / "calibration")
     a = made("monday", [0] * 6)
     outcome = lce_rig("repeat", a, a.parent / "unfinished")

@@ -25,7 +25,7 @@ def two_results(calibrated_once, tmp_path):
     return shutil.copytree(make_once("two_results", make), tmp_path / "session")
 
 
-def test_a_named_result_leaves_the_current_one_alone(lce_rig, calibrated):
+def test_named_result_keeps_current_result(lce_rig, calibrated):
     assert lce_rig("repeat", calibrated).code == 2
     assert lce_rig("repeat", calibrated, "--name", "paper", "--name", "current").code == 4
     before = contents(calibrated / "calibration")
@@ -86,7 +86,7 @@ def test_calibrate_bad_name_is_refused(lce_rig, session, name):
 
 
 @pytest.mark.long
-def test_overlays_move_with_a_named_result(lce_rig, two_results):
+def test_named_result_has_its_own_overlays(lce_rig, two_results):
     folder = two_results / "results" / "paper"
     assert lce_rig("verify", two_results, "--name", "paper").code == 0
     used = json.loads((folder / "result.json").read_text())["pairs"][0]["captures_used"]

@@ -10,7 +10,7 @@ from lce_rig.rig import find_profile, load_rig
 from tests.shared import files_up_to
 
 
-def test_called_bare_it_lists_the_profiles(capsys):
+def test_rigs_without_argument_lists_profiles(capsys):
     assert run(["rigs"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in ("rlfs", "rles", "sss", "DAVIS346"))
@@ -38,7 +38,7 @@ def test_show_prints_a_profile_that_loads_again(capsys, tmp_path, more):
     assert json.loads(capsys.readouterr().out)["board"]["square_m"] == 0.07
 
 
-def test_check_exits_by_what_it_finds(capsys, tmp_path):
+def test_rigs_check_exit_code_follows_problems(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     assert run(["rigs", "new", "mine", "--from", "sss", "-o", str(path)]) == 0
     assert run(["rigs", "check", str(path)]) == 0
@@ -54,7 +54,7 @@ def test_check_exits_by_what_it_finds(capsys, tmp_path):
     assert [finding.code for finding in load_rig(turned).warnings()] == ["profile.swapped_sides"]
 
 
-def test_new_writes_a_profile_and_never_over_another(capsys, tmp_path, monkeypatch):
+def test_rigs_new_never_overwrites_profile(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(["rigs", "new", "mine", "--from", "rlfs", "--set", "board.square_m=0.065"]) == 0
     assert load_rig("mine.yaml").board.square_m == 0.065
@@ -73,7 +73,7 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys, tmp_path):
     assert run(["rigs", "new", "mine", "-o", str(path)]) == 0
 
 
-def test_a_profile_of_ones_own_sensors_takes_one_command(capsys, tmp_path):
+def test_rigs_new_creates_profile_in_one_command(capsys, tmp_path):
     path = tmp_path / "os1.yaml"
     lens = "equidistant,1920x1208,959.554,960.194,940.789,670.737,-0.097824,0.141429,-0.148385,0.055918"
     words = ["rigs", "new", "os1", "--lidar", "OS1-64", "--intrinsics", lens, "-o", str(path)]
@@ -108,7 +108,7 @@ def test_a_profile_that_cannot_be_written_leaves_no_file(words, code, tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_derived_profile_keeps_no_block_that_was_emptied(tmp_path):
+def test_derived_profile_drops_emptied_block(tmp_path):
     path = tmp_path / "mine.yaml"
     emptied = ["--set", "nominal_extrinsics=[]", "--set", "cameras.cam.driver={}"]
     assert run(["rigs", "new", "mine", *emptied, "-o", str(path)]) == 0

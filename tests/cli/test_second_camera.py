@@ -44,7 +44,7 @@ def test_camera_without_result_exits_with_6(lce_rig, with_second):
 
 
 @pytest.mark.long
-def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second, calibrated_once):
+def test_requested_camera_is_calibrated_alone(lce_rig, with_second, calibrated_once):
     assert lce_rig("calibrate", with_second, "--camera", "davis").code == 0
     own, alone = (
         json.loads((path / "calibration" / "result.json").read_text())["pairs"]
@@ -58,7 +58,7 @@ def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second,
 
 
 @pytest.mark.long
-def test_reference_without_names_is_of_one_camera_only(lce_rig, with_second):
+def test_reference_without_names_needs_single_camera(lce_rig, with_second):
     truth = json.loads((with_second / "truth.json").read_text())
     (with_second / "bare.json").write_text(json.dumps({"T_cam_lidar": truth["T_cam_lidar"]}))
     outcome = lce_rig("calibrate", with_second, "--reference", with_second / "bare.json")

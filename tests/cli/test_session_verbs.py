@@ -89,7 +89,7 @@ def test_result_hashes_match_sha256sum(lce_rig, session):
 
 
 @pytest.mark.long
-def test_the_reference_never_enters_the_estimate(lce_rig, session):
+def test_reference_does_not_affect_estimate(lce_rig, session):
     plain = json.loads(lce_rig("calibrate", session, "--json").out)["pairs"][0]
     wrong = np.array(read(session / "truth.json")["T_cam_lidar"])
     wrong[:3, 3] += 1.0
@@ -204,7 +204,7 @@ def test_too_few_captures_name_the_minimum(lce_rig, session):
         assert "minimum 6" in outcome.err + outcome.out
 
 
-def test_sessions_that_cannot_be_meant_exit_with_4(lce_rig, session):
+def test_implausible_session_paths_exit_with_4(lce_rig, session):
     assert lce_rig("verify", session).code == 4  # before anything was calibrated
     assert lce_rig("simulate", "--rig", "rles", session, "--captures", "1").code == 4
     marker = session / "session.json"

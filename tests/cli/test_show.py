@@ -17,7 +17,7 @@ def test_progress_lines_every_tenth_is_printed(capsys):
     assert len(lines) == 9 and lines[0] == "collecting: 30 of 300 (10 %)"
 
 
-def test_progress_lines_slow_work_is_seen_alive(capsys):
+def test_progress_lines_slow_work_is_reported_regularly(capsys):
     assert len(lines_of(capsys, 10.0, 100)) == 39
 
 

@@ -71,7 +71,7 @@ def test_the_session_holds_exactly_what_was_simulated(moving, simulated):
         assert np.array_equal(getattr(events, column), getattr(simulated.events[0], column))
 
 
-def test_truth_names_the_speed_and_the_board(truth, simulated):
+def test_simulated_truth_has_speed_and_board(truth, simulated):
     assert truth["motion"] == "moving"
     for sensor, board in truth["captures"]["000000"]["boards"].items():
         expected = simulated.T_sensor_board(sensor, board["t_ns"])

@@ -19,11 +19,11 @@ def test_without_a_result_it_exits_with_4(lce_rig, session):
     assert lce_rig("view", session).code == 4
 
 
-def test_a_capture_that_is_not_there_is_refused(lce_rig, calibrated):
+def test_missing_capture_is_refused(lce_rig, calibrated):
     assert lce_rig("view", calibrated, "--capture", "999999").code == 4
 
 
-def test_a_file_that_is_no_picture_stays_as_it_was(lce_rig, calibrated, tmp_path):
+def test_view_keeps_file_that_is_not_an_image(lce_rig, calibrated, tmp_path):
     file = tmp_path / "notes.txt"
     file.write_text("mine")
     assert lce_rig("view", calibrated, "-o", file).code == 5

@@ -140,7 +140,7 @@ def test_collect_torn_file_keeps_captures(tmp_path, lidar):
     assert any("torn ends" in note for note in report.notes)
 
 
-def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar):
+def test_non_overlapping_clocks_are_an_error(tmp_path, lidar):
     late = [replace(e, t_ns=e.t_ns + 1_234_500_000_000) for e in moves.events()]
     write_aedat4(tmp_path / "late.aedat4", late)
     with pytest.raises(SourceError, match=r"davis\.events"):
@@ -151,7 +151,7 @@ def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar):
     assert report.captured == ["000000"] and len(report.errors) == 1
 
 
-def test_captures_whose_events_begin_late_are_kept(tmp_path):
+def test_captures_with_late_events_are_kept(tmp_path):
     start_ns = moves.recording().start_ns + 900_000_000
     late = [s for s in moves.samples() if not isinstance(s, Events) or s.t_ns[0] >= start_ns]
     session, report = run(tmp_path / "s", moves.bag(tmp_path / "late.bag", late))

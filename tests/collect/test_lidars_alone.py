@@ -112,7 +112,7 @@ def test_collect_moving_plate_is_skipped(tmp_path: Path, rig: Rig) -> None:
     assert not report.captured and "read.no_other" in report.counts.by_code()
 
 
-def test_scans_of_one_lidar_are_refused_with_what_to_add(tmp_path: Path, rig: Rig) -> None:
+def test_single_lidar_scans_are_refused_with_action(tmp_path: Path, rig: Rig) -> None:
     one = recorded([place(2.5, 15, 45, 20)] * 8)
     one.samples_read = [scan for scan in one.samples_read if scan.sensor == "left"]
     with Session.create(tmp_path / "s", rig) as session, pytest.raises(SourceError):
@@ -139,7 +139,7 @@ def test_collect_lidar_folders_match_by_name(tmp_path: Path, rig: Rig, above: st
         assert not collect(session, [open_recording(folder, rig)]).captured
 
 
-def test_a_folder_of_one_lidars_clouds_is_refused(tmp_path: Path, rig: Rig) -> None:
+def test_folder_of_single_lidar_is_refused(tmp_path: Path, rig: Rig) -> None:
     (tmp_path / "left").mkdir()
     (tmp_path / "left" / "0.pcd").write_bytes(b"")
     with pytest.raises(SourceError):

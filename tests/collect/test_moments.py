@@ -78,7 +78,7 @@ def test_collect_torn_bag_keeps_captures(tmp_path, write_bag, rig):
 
 
 @pytest.mark.long
-def test_a_board_that_never_stands_still_is_never_captured(tmp_path, write_bag, rig):
+def test_moving_board_is_never_captured(tmp_path, write_bag, rig):
     bag = write_bag(tmp_path / "a.bag", [0, 1, 2, 3] * 3)
     with Session.create(tmp_path / "s", rig) as session:
         assert collect(session, [open_recording(bag, rig)]).captured == []

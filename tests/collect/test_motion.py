@@ -27,7 +27,7 @@ def places_m(moments):
     return [float(m.detection.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
 
 
-def test_a_board_that_passes_slowly_is_taken_once_a_place(rles):
+def test_slow_board_is_captured_once_per_placement(rles):
     moments, refused = choose(watch(rles, lambda t: (0.1 * t - 0.25, 0.0), 5.0, SOME), rles)
     assert len(moments) in (3, 4) and not refused
     assert np.diff(places_m(moments)).min() >= 0.15
@@ -69,7 +69,7 @@ def test_motion_slowest_part_is_preferred(rles):
     assert all(np.diff(sorted(places_m(moments))) >= 0.15)
 
 
-def test_moments_before_the_stream_or_after_it_are_counted(rles):
+def test_motion_moments_outside_stream_are_counted(rles):
     stream = event_stream([(1.0, 2.0, 4.0)])
     _, refused = choose(watch(rles, lambda t: (0.05 * t, 0.0), 6.0, stream), rles)
     # Scans 8 to 31 begin less than 1.2 s after its end and end less than 0.15 s before its beginning.
@@ -85,11 +85,11 @@ def test_motion_gate_frames_without_events_are_kept(rles, speed_mps, is_kept):
     assert all(m.figures["speed_mps"] == pytest.approx(speed_mps, abs=0.001) for m in moments)
 
 
-def test_a_board_that_the_lidar_does_not_see_is_no_moment(rles):
+def test_motion_board_missing_in_scan_is_not_captured(rles):
     assert choose(watch(rles, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rles) == ([], {})
 
 
-def test_a_board_that_comes_back_is_not_taken_twice(rles):
+def test_motion_returning_board_is_captured_once(rles):
     moments, _ = choose(watch(rles, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rles)
     places = sorted(places_m(moments))
     assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15

@@ -103,7 +103,7 @@ def test_collect_unreadable_folder_is_error(tmp_path, folder, rig):
         run(session, folder, rig)
 
 
-def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
+def test_collect_limit_is_kept_and_skipped_are_counted(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig, n_wanted=2)
         assert len(session.captures) == 2 and report.n_missing == 0
@@ -147,7 +147,7 @@ def test_collect_killed_runs_lose_no_capture(tmp_path, folder):
 
 
 @pytest.mark.dataset
-def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
+def test_foreign_recording_becomes_a_session(tmp_path, recordings):
     rig = load_rig("rlfs")
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, recordings / "rlfs01", rig)

@@ -46,7 +46,7 @@ def test_track_jumped_board_is_found_early():
         assert nearest_m(see(watcher, k, time_s), k) < 0.3, (k, time_s)
 
 
-def test_track_board_out_of_sight_is_sought():
+def test_track_lost_board_is_searched_for():
     watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     assert nearest_m(see(watcher, 0, 0.0), 0) < 0.3
     capture = placements()[0]
@@ -56,7 +56,7 @@ def test_track_board_out_of_sight_is_sought():
     assert nearest_m(see(watcher, 3, 1.0), 3) < 0.3
 
 
-def test_tracker_lens_misfit_is_not_no_board():
+def test_tracker_reports_lens_misfit_not_missing_board():
     watcher = BoardTracker(strict(max_reprojection_px=0.001), 1.0)
     capture = placements()[0]
     blank = replace(capture.images[0], pixels=np.full_like(capture.images[0].pixels, 90))

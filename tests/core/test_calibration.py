@@ -81,7 +81,7 @@ def edited(path, edit):
     return path
 
 
-def test_the_published_keys_are_there_in_order():
+def test_result_json_has_published_keys_in_order():
     document = result_file("rles", [full()]).document()
     assert list(document) == ["format_version", "rig", "made_by", "inputs_sha256", "pairs"]
     assert (document["format_version"], document["rig"]) == (1, "rles")
@@ -117,7 +117,7 @@ def test_every_field_is_read_back_to_the_last_digit(tmp_path, phi, t, scale, cau
     assert read.pairs[0].captures_refused == written.captures_refused
 
 
-def test_figures_that_are_not_known_are_null(tmp_path):
+def test_unknown_figures_are_null(tmp_path):
     unknown = calibration(metrics=Metrics(np.nan, 0.1, 0.2), certificate=Certificate(False, np.inf))
     path = tmp_path / "result.json"
     path.write_text(as_text(unknown))
@@ -129,7 +129,7 @@ def test_figures_that_are_not_known_are_null(tmp_path):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["T_cam_lidar", "cov", "cov_shared"])
-def test_an_array_that_is_not_finite_is_refused(name, bad):
+def test_non_finite_array_is_refused(name, bad):
     array = np.array(getattr(calibration(), name))
     array[0, 3] = bad
     with pytest.raises(ResultRefusedError):
@@ -214,7 +214,7 @@ def test_result_damaged_gives_session_error(tmp_path, data):
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"null", b"\xff\xfe", b"[" * 100_000])
-def test_a_file_that_is_no_result_is_refused(tmp_path, content):
+def test_file_without_result_is_refused(tmp_path, content):
     path = tmp_path / "result.json"
     path.write_bytes(content)
     with pytest.raises(SessionError):

@@ -43,7 +43,7 @@ def test_projection_agrees_with_opencv(camera):
 
 
 @CAMERAS
-def test_points_behind_the_camera_are_not_drawn(camera):
+def test_points_behind_camera_are_not_projected(camera):
     pixels, is_valid = camera.project(np.array([[0.1, 0.2, -2.0], [0.0, 0.0, -1e-9], [0.0, 0.0, 2.0]]))
     assert is_valid.tolist() == [False, False, True]
     assert np.isnan(pixels[:2]).all()
@@ -61,13 +61,13 @@ def test_camera_folded_points_are_excluded():
     assert camera.project(np.array([[near_the_fold, 0, 1.0]]))[1][0]
 
 
-def test_a_pixel_no_ray_reaches_has_no_ray():
+def test_unreachable_pixel_has_no_ray():
     camera = Intrinsics(500.0, 500.0, 320.0, 240.0, 640, 480, "radtan", (-0.5,))
     assert np.isnan(camera.unproject(np.array([3000.0, 240.0]))).all()
     assert np.isfinite(camera.unproject(np.array([320.0, 240.0]))).all()
 
 
-def test_inside_means_within_the_picture_less_the_margin():
+def test_is_inside_respects_margin():
     pixels = np.array([[0.0, 0.0], [1279.0, 719.0], [1279.5, 3.0], [5.0, 5.0], [np.nan, 3.0]])
     assert PINHOLE.is_inside(pixels).tolist() == [True, True, False, True, False]
     assert PINHOLE.is_inside(pixels, margin_px=5).tolist() == [False, False, False, True, False]
@@ -79,7 +79,7 @@ RATIONAL = Intrinsics(
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE, RATIONAL])
-def test_its_derivative_is_that_of_differences(camera):
+def test_projection_derivative_matches_differences(camera):
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.4, 0.4, (50, 2)), np.ones(50)]) * rng.uniform(1, 5, (50, 1))
     points[0, :2] = 0.0

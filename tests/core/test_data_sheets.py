@@ -11,7 +11,7 @@ from lce_rig.core.data_sheets import DATA_SHEETS, VLP_16, DataSheet, find_data_s
 
 
 @pytest.mark.parametrize("sheet", DATA_SHEETS, ids=lambda sheet: sheet.name)
-def test_every_model_is_whole_and_names_its_source(sheet):
+def test_data_sheets_are_complete_with_source(sheet):
     assert sheet.source
     assert set(sheet.estimated) <= set(DataSheet.__dataclass_fields__)
     if not sheet.has_rings:
@@ -34,7 +34,7 @@ def test_every_model_is_in_the_documentation():
 
 
 @pytest.mark.parametrize("name", ["VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "Alpha Prime"])
-def test_velodynes_beams_are_those_of_its_calibration_files(name):
+def test_velodyne_beams_match_calibration_files(name):
     folder = Path(velodyne_decoder.__file__).parent / "calibrations"
     document = yaml.safe_load((folder / f"{name}.yml").read_text(encoding="utf-8"))
     lasers = sorted(document["lasers"], key=lambda laser: int(laser["laser_id"]))
@@ -71,7 +71,7 @@ def test_data_sheet_any_spelling_is_found(spelling, name):
     assert (found and found.name) == name
 
 
-def test_a_units_own_beams_replace_the_models():
+def test_unit_beams_replace_model_beams():
     own = VLP_16.with_rings((-10.0, 0.0, 10.0), 2048)
     assert np.degrees(own.rings_rad) == pytest.approx([-10, 0, 10])
     assert own.step_rad(10.0) == own.step_rad(20.0) == pytest.approx(2 * np.pi / 2048)

@@ -31,7 +31,7 @@ def test_events_come_back_to_the_nanosecond(t_ns, host_ns):
 
 
 @pytest.mark.parametrize("data", [b"[" * 100_000, b"[NaN]", b"[-Infinity]", b"\xff[1]", b'["\\ud800"]', b""])
-def test_what_is_no_json_is_refused(data):
+def test_parse_json_refuses_invalid_json(data):
     with pytest.raises(ValueError):
         parse_json(data)
 

@@ -98,7 +98,7 @@ def _kind(expression, module):
     return at if isinstance(at, Kind) else None
 
 
-def test_actions_of_callers_are_their_kinds():
+def test_actions_match_their_kinds():
     uses = _uses()
     assert len({place for place, *_ in uses}) > 15
     assert len({(kind.code, action) for _, kind, action, _ in uses}) > 25

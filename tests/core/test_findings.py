@@ -32,7 +32,7 @@ def test_a_figure_that_is_not_finite_reads_as_unknown():
         (0.012, 0.012, 60.0, "error 12 mm (limit 12 mm), tilt 60 deg (60 deg)"),
     ],
 )
-def test_figure_is_printed_unlike_its_limit(error_m, limit_m, tilt_deg, words):
+def test_figure_is_distinguishable_from_its_limit(error_m, limit_m, tilt_deg, words):
     assert LIMIT(error_m=error_m, limit_m=limit_m, tilt_deg=tilt_deg, max_tilt_deg=60.0).text == words
 
 

@@ -27,7 +27,7 @@ def test_log_undoes_exp_below_pi(phi):
 
 
 @given(vectors, st.floats(1e-9, 1e-3))
-def test_exp_is_smooth_where_its_series_takes_over(direction, angle):
+def test_exp_is_smooth_at_series_switch(direction, angle):
     phi = direction / max(np.linalg.norm(direction), 1e-9) * angle
     R = exp_so3(phi)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)

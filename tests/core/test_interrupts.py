@@ -84,7 +84,7 @@ def test_interrupt_busy_ends_after_grace(busy):
     assert said == INTERRUPTED + "\n"
 
 
-def test_who_presses_twice_does_not_wait():
+def test_second_interrupt_ends_at_once():
     busy = textwrap.indent(BUSY["a pool whose job goes on"], "    ")
     with running(f"    with patience(60):\n{busy}") as process:
         press_until_it_ends(process)

@@ -38,7 +38,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("encoding", BODIES)
-def test_clouds_of_every_encoding_are_read_exactly(encoding):
+def test_pcd_all_encodings_are_read_exactly(encoding):
     read = decode_pcd(f"{HEAD}{encoding}\n".encode() + BODIES[encoding])
     assert read.dtype.names == CLOUD.dtype.names
     assert read.tolist() == CLOUD.tolist() == decode_pcd(encode_pcd(read, ["made here"])).tolist()
@@ -52,7 +52,7 @@ def test_damaged_clouds_are_read_or_refused(encoding, data):
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_headers_as_matlab_writes_them_are_read(end):
+def test_pcd_matlab_header_is_read(end):
     read = decode_pcd(MATLAB.replace(b"\n", end) + np.arange(8, dtype="<f4").tobytes())
     assert read["intensity"].tolist() == [3.0, 7.0]
 

@@ -62,7 +62,7 @@ def test_exact_corners_give_the_exact_pose(camera, tilt_deg, about_deg, roll_deg
     [(RADTAN, 40.0, 1.5), (RADTAN, 25.0, 2.5), (FISHEYE, 25.0, 2.5)],
     ids=["near", "far", "fisheye"],
 )
-def test_the_covariance_is_what_monte_carlo_scatters(camera, tilt_deg, z_m):
+def test_planar_pose_covariance_matches_monte_carlo(camera, tilt_deg, z_m):
     T, sigma_px, n = looking(tilt_deg, 30, 40, (0.2, -0.1, z_m)), 0.15, 300
     runs = [solve(seen(T, camera, sigma_px, seed), camera) for seed in range(n)]
     errors = np.array([difference(run.T_cam_board, T) for run in runs])
@@ -92,7 +92,7 @@ def test_planar_pose_both_minima_are_found(camera):
 
 @pytest.mark.parametrize("n_starts", [1, 2])
 @pytest.mark.parametrize("swapped", [False, True])
-def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts, swapped):
+def test_planar_pose_warm_start_finds_same_minima(n_starts, swapped):
     before = solve(seen(looking(15, 40, 30, (0.1, 0.0, 4.5)), RADTAN, 0.1, 1), RADTAN)
     corners = seen(looking(17, 44, 31, (0.12, 0.01, 4.55)), RADTAN, 0.1, 2)
     alone = solve(corners, RADTAN)

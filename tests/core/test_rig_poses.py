@@ -50,7 +50,7 @@ def test_find_rig_poses_propagates_each_covariance(uncertain):
     np.testing.assert_allclose(sizes(right), expected, rtol=1e-3)
 
 
-def test_find_rig_poses_leaves_out_failed_pairs():
+def test_find_rig_poses_skips_failed_pairs():
     given = [pair("left", "front"), pair("right", "front", verdict="fail")]
     assert [each.sensor for each in find_rig_poses(given, LIDARS).sensors] == ["left"]
     # Another pair that has not failed gives its pose.

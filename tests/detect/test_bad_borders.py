@@ -39,7 +39,7 @@ def boards(border: str, has_rings: bool, n: int = 5) -> list[tuple[LidarBoard, A
 
 @pytest.mark.parametrize("has_rings", [True, False], ids=["rings", "no rings"])
 @pytest.mark.parametrize("border", [name for name in SCENES if name != "smeared by 20 mm"])
-def test_border_seen_in_part_has_ends_where_it_is(border: str, has_rings: bool) -> None:
+def test_partly_visible_border_has_ring_ends(border: str, has_rings: bool) -> None:
     for board, T in boards(border, has_rings):
         # With rings, an end lies up to a step inside.
         step_m = board.azimuth_step_rad * board.quality.distance_m / 0.7

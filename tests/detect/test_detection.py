@@ -18,7 +18,7 @@ def assert_same(a, b):
             assert value == getattr(b, name)
 
 
-def test_boards_of_both_sensors_come_back_as_they_were():
+def test_detections_round_trip():
     item = simulate(1, seed=0)[0]
     assert_same(item.image, from_arrays(to_arrays(item.image)))
     boards = from_arrays(to_arrays([item.lidar]))
@@ -26,12 +26,12 @@ def test_boards_of_both_sensors_come_back_as_they_were():
     assert_same(item.lidar, boards[0])
 
 
-def test_a_refusal_comes_back_as_it_was():
+def test_refusal_round_trips():
     refusal = Refusal("image.low_contrast", figures={"contrast": 28.5, "min_contrast": 50.0}, action="events")
     assert from_arrays(to_arrays(refusal)) == refusal
 
 
-def test_arrays_that_are_no_detection_are_refused():
+def test_invalid_detection_arrays_are_refused():
     with pytest.raises(ValueError):
         from_arrays({"head": np.frombuffer(b'{"items": 3}', dtype=np.uint8)})
     with pytest.raises(ValueError):

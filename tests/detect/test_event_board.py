@@ -71,7 +71,7 @@ def test_event_board_track_matches_truth(detection):
         assert np.arccos(np.clip(-T[2, 2], -1, 1)) < np.radians(8)
 
 
-def test_speed_and_smear_are_those_of_the_true_motion(detection):
+def test_event_board_speed_and_smear_match_truth(detection):
     # The mean motion over the track: the board turns on its figure of eight meanwhile.
     stamps = STAMP + np.array([0, *TRACK_NS])
     places = np.array([truth_m(stamp) for stamp in stamps])

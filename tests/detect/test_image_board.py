@@ -160,7 +160,7 @@ def test_image_board_far_part_is_no_other():
     assert refusal.code == "image.part" and "n_cols_seen" not in refusal.figures
 
 
-def test_a_board_cut_off_by_the_border_is_said_to_be():
+def test_image_board_cut_by_border_is_reported():
     shifted = replace(WIDE, cx_px=1180.0)
     pixels = draw(SYMMETRIC, shifted, looking(5, 0, 5, (0.0, 0.0, 1.8)))
     refusal = refused(pixels, SYMMETRIC, shifted)
@@ -185,7 +185,7 @@ def test_image_board_bad_images_are_refused():
         assert (refusal.code, refusal.action) == (code, "")
 
 
-def test_an_empty_event_picture_asks_for_motion():
+def test_empty_event_image_advises_motion():
     grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
     result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS, is_from_events=True)
     assert (result.code, result.action) == ("image.low_contrast", "events")

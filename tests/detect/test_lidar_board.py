@@ -52,7 +52,7 @@ def test_board_is_found_on_every_side_of_the_lidar(azimuth_deg):
 
 
 @pytest.mark.parametrize("start_deg", [28, 30, 180])
-def test_board_at_the_seam_of_the_sweep_is_found_whole(start_deg):
+def test_board_at_scan_seam_is_complete(start_deg):
     T = place(2.5, 30)
     assert_is_board(find(cast([board_plate(T), *ROOM], sigma_m=0.01, start_deg=start_deg)), T)
 
@@ -65,7 +65,7 @@ def rotated_about_z(scan, deg):
     )
 
 
-def test_lidar_yaw_keeps_what_lies_behind():
+def test_lidar_board_yaw_keeps_background():
     scan = cast([board_plate(place(2.5, 20)), *ROOM], sigma_m=0.01)
     ahead = find(scan)[0]
     # Rings are cut at their first break from azimuth -180 deg on; boards at every angle to it.
@@ -75,7 +75,7 @@ def test_lidar_yaw_keeps_what_lies_behind():
         assert np.isfinite(turned.edge_behind_m).sum() == np.isfinite(ahead.edge_behind_m).sum(), deg
 
 
-def test_a_second_turn_of_a_long_sweep_changes_nothing():
+def test_overlapping_revolution_changes_nothing():
     T = place(2.5, 30)
     scan = cast([board_plate(T), *ROOM], sigma_m=0.01)
     twice = scan.select(np.concatenate([np.arange(len(scan.points)), np.arange(8000)]))
@@ -84,7 +84,7 @@ def test_a_second_turn_of_a_long_sweep_changes_nothing():
 
 @pytest.mark.parametrize("roll_deg", [0, 20, 45, 70, 90])
 @pytest.mark.parametrize("distance_m", [1.2, 2, 3, 4, 5])
-def test_board_is_found_at_every_distance_however_it_hangs(distance_m, roll_deg):
+def test_board_is_found_at_every_distance_and_roll(distance_m, roll_deg):
     T = place(distance_m, 20, roll_deg)
     # A board that hangs straight shows its height only to within the gap between two rings.
     free_m = 0.02 if roll_deg % 90 else 0.5 * np.radians(2.0) * distance_m
@@ -132,7 +132,7 @@ def test_board_is_found_at_every_noise_level_of_the_paper(sigma_m):
 
 @pytest.mark.parametrize("behind_m", [0.1, 0.2, 0.4])
 @pytest.mark.parametrize("roll_deg", [0, 45])
-def test_person_behind_the_board_is_no_part_of_it(behind_m, roll_deg):
+def test_person_behind_board_is_excluded(behind_m, roll_deg):
     T = place(2.0, 160, roll_deg, 15, -10)
     scan = cast([board_plate(T), *person(T, behind_m), *ROOM], sigma_m=0.008, seed=1, mixed_share=0.7)
     found = find(scan)
@@ -176,7 +176,7 @@ def test_hands_over_border_move_nothing():
     assert np.abs(outline_distance(found[0].edge_points, T)).max() < 0.025
 
 
-def test_plate_beside_board_does_no_harm():
+def test_plate_beside_board_changes_nothing():
     T = place(2.5, 30)
     beside = T @ pose(np.eye(3), np.array([BOARD.width_m / 2 + 0.45, 0, 0]))
     assert_is_board(find(cast([board_plate(T), Plate(beside, 0.8, 0.6), *ROOM], sigma_m=0.01)), T)
@@ -221,7 +221,7 @@ def test_lidar_board_is_unbiased():
 
 
 @pytest.mark.parametrize("scale", [0.95, 1.03, 1.08])
-def test_board_of_another_size_is_measured_not_cut_to_size(scale):
+def test_other_size_board_is_measured_at_full_size(scale):
     T = place(2.3, 30)
     quality = find(cast([board_plate(T, scale=scale), *ROOM], sigma_m=0.01))[0].quality
     area_m2 = quality.width_m * quality.height_m
@@ -247,7 +247,7 @@ def test_empty_scan_is_refused_with_its_count():
     assert isinstance(find(nothing.select(np.zeros(0, dtype=int))), Refusal)
 
 
-def test_two_rings_are_refused_with_the_way_to_go():
+def test_two_rings_are_refused_with_distance_advice():
     T = place(5.0, 30, 0, 0, 60)
     refusal = find(cast([board_plate(T), *room(16.0)], sigma_m=0.01))
     assert (refusal.code, refusal.figures["n_rings"]) == ("lidar.too_few_rings", 2)
@@ -292,7 +292,7 @@ def test_plate_in_larger_plane_is_no_rival():
 
 
 @pytest.mark.parametrize(("wall_intensity", "brightness"), [(50, 0.5), (20, 0.2), (None, 1.0)])
-def test_ring_ends_tell_how_strong_the_echo_from_behind_is(wall_intensity, brightness):
+def test_ring_ends_have_background_echo_strength(wall_intensity, brightness):
     """A wall 2 m behind a board at 2 m, brighter or darker; without intensities both count as alike."""
     wall = Plate(place(4.0, roll_deg=0.0), 8.0, 6.0)
     scan = cast([board_plate(place(2.0)), wall], sigma_m=0.005)

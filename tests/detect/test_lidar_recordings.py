@@ -57,7 +57,7 @@ def expected_centre(image, folder, board):
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_a_board_of_the_right_size_is_found_in_every_scan(recordings, name):
+def test_recording_board_is_found_in_every_scan(recordings, name):
     folder = recordings / name
     board = board_of(folder)
     refused, ratios = {}, []
@@ -74,7 +74,7 @@ def test_a_board_of_the_right_size_is_found_in_every_scan(recordings, name):
 
 
 @pytest.mark.parametrize("name", ["rlfs01", "sss_noise15mm", "rles01_lf", "rles02_lf"])
-def test_the_first_candidate_is_the_board_of_the_picture(recordings, name):
+def test_first_candidate_matches_image(recordings, name):
     folder = recordings / name
     board, scans = board_of(folder), scans_of(folder)
     images = sorted((folder / "img").iterdir())

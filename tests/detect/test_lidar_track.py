@@ -1,4 +1,4 @@
-"""The board about a pose: that of the scan before, or one that an image predicts."""
+"""Search for the board near a pose: from the previous scan, or predicted from an image."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def view(T, seed=0):
     return cast([board_plate(T), *person(T, 0.2), *room(13.0)], sigma_m=0.008, seed=seed)
 
 
-def test_board_in_motion_is_followed_through_every_scan():
+def test_moving_board_is_tracked_in_every_scan():
     board = find_lidar_boards(view(place(2.5, 170)), BOARD, LIMITS)[0]
     for k in range(1, 12):
         T = place(2.5 - 0.04 * k, 170 + 1.5 * k, 45 + 2 * k, 3 * k)

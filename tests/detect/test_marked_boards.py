@@ -76,7 +76,7 @@ def test_aprilgrid_noise_does_not_join_tags(noise):
 
 
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
-def test_low_contrast_hides_no_board_with_markers(board):
+def test_marked_board_is_found_at_low_contrast(board):
     pixels = draw(board, WIDE, NEAR)
     dim = np.rint(60 + 40.0 * (pixels / 255.0)).astype(np.uint8)
     assert np.isfinite(found(dim, board, WIDE).corners_px).mean() > 0.9
@@ -93,7 +93,7 @@ def test_strong_lenses_and_small_images_show_all_corners(board, camera, distance
 
 @pytest.mark.parametrize("roll_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("board", [EVEN, APRILGRID], ids=["charuco", "aprilgrid"])
-def test_markers_tell_which_end_is_up(board, roll_deg):
+def test_markers_determine_orientation(board, roll_deg):
     T = looking(20, 70, roll_deg, (0, 0, 1.8))
     result = found(draw(board, WIDE, T), board, WIDE)
     assert rotation_angle(result.T_cam_board[:3, :3], T[:3, :3]) < np.radians(1)
@@ -186,7 +186,7 @@ def test_few_corners_are_refused():
 
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
 @pytest.mark.parametrize("is_covered", [False, True], ids=["whole", "covered"])
-def test_a_board_is_followed_to_where_it_is(board, is_covered):
+def test_marked_board_is_tracked(board, is_covered):
     """Moved by a little, and by whole squares or tags, where crossings of the same colours are."""
 
     def seen(T):

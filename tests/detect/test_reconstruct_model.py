@@ -11,7 +11,7 @@ def test_the_shipped_model_is_at_most_1_mb():
 
 
 @pytest.mark.parametrize(("width", "height"), [(346, 260), (173, 131), (64, 64)])
-def test_pictures_have_the_sensors_size_whatever_it_is(width, height):
+def test_reconstructed_images_have_sensor_size(width, height):
     model = ReconstructionModel()
     states = model.initial_states(height, width)
     picture, following = model.step(np.zeros((model.n_bins, height, width), np.float32), states)

@@ -67,7 +67,7 @@ def test_reconstruct_tags_are_planar(recording):
     assert np.mean(residuals) <= 1.32
 
 
-def test_tags_are_read_at_the_stamps_of_a_lidar_too(recording):
+def test_tags_are_read_at_lidar_timestamps(recording):
     last_ns = recording.span_ns[1]
     stamps = range(last_ns - 200_000_000, last_ns + 1, 50_000_000)
     pictures = list(Reconstructor().reconstruct(recording, list(stamps)))

@@ -39,20 +39,20 @@ def errors_px(events, motion=STEADY, stamps=STAMPS):
     return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
 
 
-def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream):
+def test_reconstructed_board_matches_truth_at_each_timestamp(stream):
     errors = errors_px(stream)
     assert np.isfinite(errors).mean() >= 0.9
     assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
 
 
-def test_the_picture_lasts_while_the_board_stands_still():
+def test_reconstructed_image_persists_for_still_board():
     events = board_events(PAUSE, DURATION_S)
     stamps = [1_200 * MS, 1_500 * MS]
     errors = errors_px(events, PAUSE, stamps)
     assert (errors < 1.0).all()
 
 
-def test_batches_may_be_cut_anywhere(stream):
+def test_reconstruct_ignores_batch_boundaries(stream):
     whole, parts = (
         list(Reconstructor().reconstruct(batches, STAMPS[:4])) for batches in ([stream], cut(stream, 37))
     )
@@ -90,7 +90,7 @@ def test_reconstruct_bad_events_are_an_error(stream):
             list(Reconstructor().reconstruct(batches, [9_000 * MS]))
 
 
-def test_an_hour_of_silence_costs_no_hour_of_steps(stream):
+def test_reconstruct_skips_long_silence(stream):
     first, rest = stream.between(0, 800 * MS), stream.between(800 * MS, 10_000 * MS)
     hour_ns = 3_600 * 1_000 * MS
     later = replace(rest, t_ns=rest.t_ns + hour_ns)
@@ -100,7 +100,7 @@ def test_an_hour_of_silence_costs_no_hour_of_steps(stream):
     assert reconstructor.n_steps < 100
 
 
-def test_flickering_lamps_do_not_blind_the_network_for_good(stream):
+def test_reconstruct_recovers_from_flicker(stream):
     lamp = np.arange(0, 400 * MS, 10 * MS) + 400 * MS
     y, x = (a.ravel() for a in np.mgrid[0:120:2, 0:160:2])
     storm = events_of(

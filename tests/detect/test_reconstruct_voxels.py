@@ -54,7 +54,7 @@ def test_voxels_normalised_have_unit_scatter():
     assert not normalise_voxels(np.zeros((5, 3, 4), np.float32)).any()
 
 
-def test_a_hot_pixel_is_told_from_an_edge():
+def test_hot_pixel_is_distinguished_from_edge():
     rng = np.random.default_rng(3)
     counts = rng.poisson(2, (40, 50))
     counts[:, 20:23] += 60  # an edge that went to and fro
@@ -70,14 +70,14 @@ def test_noise_filter_keeps_board_events():
     assert len(without_background_activity(noise_only)) < 0.25 * len(noise_only)
 
 
-def test_lamps_that_flicker_are_told_from_motion():
+def test_flicker_is_distinguished_from_motion():
     assert is_flickering(lamps(100))
     board = board_events(Motion(), 1.0)
     for scene in (board, noise(5.0), join(board, noise(1.0))):
         assert not is_flickering(scene)
 
 
-def test_events_of_one_polarity_alone_are_a_storm():
+def test_events_of_one_polarity_count_as_flicker():
     scene = noise(5.0)
     assert is_flickering(replace(scene, polarity=np.ones(len(scene), bool)))
     sparse = noise(0.02)

@@ -31,7 +31,7 @@ def assert_is_at(board: LidarBoard, T_lidar_board: Array, within_m: float = 0.00
 
 @pytest.mark.parametrize("roll_deg", [0, 20, 45, 70])
 @pytest.mark.parametrize(("distance_m", "yaw_deg"), [(2, 0), (3, 40), (5, -30)])
-def test_board_is_found_however_it_hangs(distance_m: float, yaw_deg: float, roll_deg: float) -> None:
+def test_unstructured_board_is_found_at_any_roll(distance_m: float, yaw_deg: float, roll_deg: float) -> None:
     T = place(distance_m, 5, roll_deg, yaw_deg)
     assert_is_at(
         best(find_unstructured_boards(accumulate([board_plate(T), *room(13)]), BOARD, POINT_BEAM)), T
@@ -49,7 +49,7 @@ def test_unstructured_board_by_box_is_found() -> None:
     assert_is_at(best(find_unstructured_boards(accumulate(shapes), BOARD, POINT_BEAM)), T, 0.02)
 
 
-def test_board_is_found_where_nothing_is_behind_it() -> None:
+def test_unstructured_board_without_background_is_found() -> None:
     T = place(4, -5, 30)
     scan = accumulate([board_plate(T), Box(pose(np.eye(3), np.array([3.0, 2.5, 0])), (1, 0.5, 2))])
     board = best(find_unstructured_boards(scan, BOARD, POINT_BEAM))
@@ -91,7 +91,7 @@ def test_other_plates_are_refused_with_their_cause() -> None:
 
 @pytest.mark.parametrize("deep_m", [0.0, 0.1], ids=["flush", "behind"])
 @pytest.mark.parametrize("side", [0, 1], ids=["beside", "below"])
-def test_box_at_the_plate_costs_what_it_touches_only(side: int, deep_m: float) -> None:
+def test_box_at_plate_hides_only_touched_border(side: int, deep_m: float) -> None:
     """A box at half of one edge, its face in the plate's plane or a hand behind it."""
     T, size_m = place(3, 5, 0, 20), np.array([BOARD.width_m, BOARD.height_m])
     box_m = np.array([0.35, 0.35, 0.3])
@@ -108,7 +108,7 @@ def test_box_at_the_plate_costs_what_it_touches_only(side: int, deep_m: float) -
 
 
 @pytest.mark.parametrize("n", [0, 5, 400])
-def test_few_points_are_no_board(n: int) -> None:
+def test_too_few_points_are_refused(n: int) -> None:
     scan = accumulate([board_plate(place(3, 5, 20)), *room(13)], n=max(n, 1)).select(np.arange(n))
     assert isinstance(find_unstructured_boards(scan, BOARD, POINT_BEAM), Refusal)
 

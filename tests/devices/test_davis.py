@@ -94,7 +94,7 @@ def play(path, settings):
     return came, source
 
 
-def test_all_that_dv_processing_wrote_comes_out(recording):
+def test_davis_file_returns_all_written_data(recording):
     came, source = play(recording, camera())
     events = [sample for sample in came if isinstance(sample, Events)]
     t_us = np.concatenate([part.t_ns for part in events]) // 1000
@@ -107,7 +107,7 @@ def test_all_that_dv_processing_wrote_comes_out(recording):
     assert source.status().serial == "00000499"
 
 
-def test_frames_are_stamped_in_the_middle_of_their_exposure(recording):
+def test_davis_images_are_timestamped_at_mid_exposure(recording):
     came, source = play(recording, camera())
     images = [sample for sample in came if isinstance(sample, Image)]
     starts_us = [START_US + INTERVAL_US * k for k in range(8) if k != 5]
@@ -127,7 +127,7 @@ def test_davis_rising_edges_are_pulses(recording):
     assert {pulse.sensor for pulse in pulses} == {"davis"}
 
 
-def test_stamps_far_from_this_computers_clock_are_a_problem(recording):
+def test_davis_timestamps_far_from_host_clock_are_a_problem(recording):
     _, source = play(recording, camera())
     status = source.status()
     assert status.problems[0] == A_NOTE and status.problems[1].code == "clock.differs_from_computer"
@@ -135,7 +135,7 @@ def test_stamps_far_from_this_computers_clock_are_a_problem(recording):
     assert status.clock is not None and status.clock.code == "clock.davis"
 
 
-def test_another_size_is_another_camera(recording):
+def test_davis_of_other_size_is_refused(recording):
     small = camera(resolution_px=(240, 180))
     with (
         attached(DavisSource("davis", small, playing(recording))) as (_, samples),
@@ -220,7 +220,7 @@ def test_davis_live_lost_sender_is_an_error():
 
 
 @pytest.mark.realtime
-def test_a_stream_that_the_profile_wants_must_be_there():
+def test_davis_missing_stream_is_an_error():
     with sender(1) as (_, port):
         source = DavisSource("davis", camera(), over_network(port))
         with pytest.raises(SourceError, match="'frames'"), attached(source):
@@ -249,7 +249,7 @@ def test_every_call_to_a_camera_exists_in_dv_processing():
     assert [name for name in sorted(asked) if not hasattr(dv.io.camera.DAVIS, name)] == []
 
 
-def test_controls_that_make_no_sense_are_named():
+def test_davis_invalid_controls_are_named():
     assert number_of("davis", "exposure_us", 4000) * timedelta(microseconds=1) == timedelta(milliseconds=4)
     for value in (True, "long", 0, -3):
         with pytest.raises(SourceError, match=r"driver\.controls\.exposure_us"):

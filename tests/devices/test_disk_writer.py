@@ -50,7 +50,7 @@ def test_disk_writer_slow_disk_drops_counted(tmp_path):
     assert (finding.code, finding.figures["n"]) == ("device.recording_incomplete", disk.n_dropped)
 
 
-def test_a_writer_that_fails_takes_nothing_more():
+def test_failed_disk_writer_accepts_nothing():
     def fail(_item):
         raise OSError(28, "No space left on device")
 

@@ -54,7 +54,7 @@ def take(samples, n):
     return [sample for sample in islice(samples, n) if isinstance(sample, Image)]
 
 
-def test_pictures_of_a_program_are_taken_as_they_arrive(tmp_path):
+def test_image_pipe_timestamps_images_on_arrival(tmp_path):
     command = child(tmp_path, raw(grey_pictures(5)))
     before_ns = time.time_ns()
     with attached(ImagePipeSource("cam", camera(*command))) as (source, samples):
@@ -70,7 +70,7 @@ def test_pictures_of_a_program_are_taken_as_they_arrive(tmp_path):
     assert status.clock is not None and status.clock.code == "clock.arrival"
 
 
-def test_pictures_are_whole_however_the_program_cuts_them(tmp_path):
+def test_image_pipe_reassembles_split_images(tmp_path):
     cut = "[(out.write(data[k : k + 7]), out.flush()) for k in range(0, len(data), 7)]; time.sleep(60)"
     command = child(tmp_path, raw(grey_pictures(2)), cut)
     with attached(ImagePipeSource("cam", camera(*command))) as (source, samples):
@@ -78,7 +78,7 @@ def test_pictures_are_whole_however_the_program_cuts_them(tmp_path):
         assert source.status().problems == ()
 
 
-def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path):
+def test_image_pipe_reports_output_of_dead_program(tmp_path):
     payload = raw(grey_pictures(2))[:-100]
     command = child(tmp_path, payload, "sys.stderr.write('no signal\\nbye\\n'); sys.exit(3)")
     with (
@@ -90,7 +90,7 @@ def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path):
     assert "signal | bye" in caught.value.hint
 
 
-def test_a_program_that_is_not_there_is_named():
+def test_image_pipe_missing_program_is_named():
     with pytest.raises(SourceError, match="no-such-program") as caught:
         attached(ImagePipeSource("cam", camera("no-such-program"))).__enter__()
     assert "installed" in caught.value.hint

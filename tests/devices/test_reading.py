@@ -60,7 +60,7 @@ def test_reading_error_follows_the_samples():
     assert not source.is_open
 
 
-def test_nothing_for_too_long_is_an_error_with_a_hint():
+def test_reading_silence_is_an_error_with_hint():
     with attached(Script(silence_s=0.1)) as (_, samples), pytest.raises(SourceError) as caught:
         counts(samples)
     assert caught.value.hint == HINT
@@ -188,7 +188,7 @@ def test_open_live_unknown_driver_is_refused(wanted):
     assert sensors(rig)[:2] == ["lidar", "cam"] and source_of(rig, "lidar").sensor == "lidar"
 
 
-def test_a_lidar_of_an_unknown_model_is_not_guessed():
+def test_unknown_lidar_model_has_no_driver():
     rig = load_rig("rlfs")
     unknown = changed(rig, lidars__lidar__model="XY-32", lidars__lidar__driver__type=None)
     with pytest.raises(SourceError) as caught:

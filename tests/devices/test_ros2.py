@@ -94,7 +94,7 @@ def graph(rig, monkeypatch):
 
 @pytest.mark.realtime
 @pytest.mark.usefixtures("graph")
-def test_images_and_scans_of_topics_come_as_from_a_bag(rig):
+def test_ros2_topics_equal_bag(rig):
     came = {"cam": [], "lidar": []}
     with AttachedSensors(open_live(rig)) as sensors:
         until_s = time.monotonic() + 60
@@ -137,7 +137,7 @@ def test_ros2_unusable_topic_lists_others(rig, monkeypatch):
     assert "lidars.lidar" in unnamed.hint
 
 
-def test_without_ros_2_the_way_to_it_is_told(rig):
+def test_ros2_missing_installation_has_hint(rig):
     if find_spec("rclpy") is not None:
         pytest.skip("ROS 2 is there")
     error = refusal(Ros2Source("cam", rig.cameras["cam"]))

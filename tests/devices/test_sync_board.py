@@ -39,7 +39,7 @@ def assert_tells_the_time(model, fake):
     assert abs(error_ns) < 5e6 + 5 * model.sigma_ns(model.last_ns)
 
 
-def test_pulses_come_one_by_one_with_the_boards_own_stamps():
+def test_sync_board_pulses_have_board_timestamps():
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         pulses = take(samples, 50)
         assert [pulse.count for pulse in pulses] == list(range(pulses[0].count, pulses[0].count + 50))
@@ -50,7 +50,7 @@ def test_pulses_come_one_by_one_with_the_boards_own_stamps():
     assert status.rate_hz > 50 and status.device.split(", ") == ["fake", "firmware 1.0", "LCE1"]
 
 
-def test_its_clock_is_tied_to_the_computers_by_asking():
+def test_sync_board_clock_is_synchronised_by_requests():
     with FakeBoard(drift=2000e-6) as fake, attached(SyncBoard(settings(fake.path))) as (board, _):
         wait_until(lambda: (clock := board.host_clock) is not None and clock.n_used >= 8)
         model = board.host_clock
@@ -63,7 +63,7 @@ def test_its_clock_is_tied_to_the_computers_by_asking():
         assert told is not None and told.figure("host_drift_ppm") == pytest.approx(-2000, rel=0.5)
 
 
-def test_its_lines_are_set_and_started_as_the_profile_says():
+def test_sync_board_lines_follow_profile():
     with FakeBoard() as fake:
         given = settings(fake.path)
         given.triggers["cam"] = given.triggers["cam"].model_copy(update={"phase_us": 2500, "pulse_us": 50})
@@ -84,7 +84,7 @@ def test_sync_board_lone_is_given_the_second():
         assert fake.host_ns(1000 * t_us) == pytest.approx(utc_s * 10**9, abs=3e6)
 
 
-def test_garbage_between_lines_is_survived_counted_and_told():
+def test_sync_board_garbage_is_counted_and_reported():
     with FakeBoard(garbage_every=3) as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         pulses = take(samples, 60)
         assert [b.count - a.count for a, b in pairwise(pulses)] == [1] * 59
@@ -93,7 +93,7 @@ def test_garbage_between_lines_is_survived_counted_and_told():
     assert damaged.figure("n") >= 19
 
 
-def test_pulses_whose_lines_are_lost_are_counted_and_told():
+def test_lost_pulse_lines_are_counted_and_reported():
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         pulses = take(samples, 10)
         fake.n_to_lose = 4
@@ -108,7 +108,7 @@ def test_pulses_whose_lines_are_lost_are_counted_and_told():
 
 
 @pytest.mark.parametrize("says_hello", [True, False])
-def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
+def test_restarted_board_is_reconfigured_and_reported(says_hello):
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         take(samples, 20)
         fake.reset(says_hello)
@@ -120,7 +120,7 @@ def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
     assert restarted.figures["n"] == 1
 
 
-def test_a_board_that_is_unplugged_is_named_with_its_port():
+def test_sync_board_unplugged_error_names_port():
     with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
         take(samples, 10)
         fake.unplug()
@@ -130,7 +130,7 @@ def test_a_board_that_is_unplugged_is_named_with_its_port():
         board.status()
 
 
-def test_a_silent_board_is_an_error_with_what_to_check():
+def test_sync_board_silence_is_an_error_with_hint():
     with FakeBoard(is_mute=True) as fake:
         with pytest.raises(SourceError, match=r"0\.3 s") as caught:
             attached(SyncBoard(settings(fake.path), hello_s=0.3)).__enter__()
@@ -141,12 +141,12 @@ def test_a_silent_board_is_an_error_with_what_to_check():
 @pytest.mark.parametrize(
     ("hello", "named"), [("READY", "/dev/"), (HELLO.replace("LCEHI,1", "LCEHI,2"), "version 2")]
 )
-def test_a_board_that_talks_otherwise_is_refused(hello, named):
+def test_sync_board_with_other_protocol_is_refused(hello, named):
     with FakeBoard(hello=hello) as fake, pytest.raises(SourceError, match=named):
         attached(SyncBoard(settings(fake.path), hello_s=3.0)).__enter__()
 
 
-def test_a_port_that_is_absent_busy_or_no_port_says_so(tmp_path):
+def test_sync_board_unusable_port_is_explained(tmp_path):
     with pytest.raises(SourceError, match="/dev/ttyLCE9") as caught:
         attached(SyncBoard(settings("/dev/ttyLCE9"))).__enter__()
     assert "sync.device" in caught.value.hint

@@ -53,7 +53,7 @@ def test_board_state_late_read_is_no_restart():
     assert state.n_restarts == 0
 
 
-def test_a_new_beginning_is_noticed_at_the_first_message():
+def test_board_state_restart_is_detected_at_first_message():
     for hello in (HELLO, None):
         state = BoardState({0: "cam"})
         pulses(state, range(20))
@@ -122,7 +122,7 @@ MESSAGES = st.one_of(
 
 
 @given(st.lists(st.tuples(MESSAGES, st.integers(0, 10**10)), max_size=60))
-def test_whatever_is_said_in_whatever_order_breaks_nothing(said):
+def test_board_state_survives_any_messages(said):
     state, steady_ns = BoardState({0: "cam", 3: "davis"}), 0
     for index, (message, later_ns) in enumerate(said):
         steady_ns += later_ns
@@ -153,7 +153,7 @@ def read(data):
 
 
 @pytest.mark.parametrize(("body", "message"), BODIES.items())
-def test_every_sentence_is_understood(body, message):
+def test_sync_every_sentence_round_trips(body, message):
     ((understood,), n_damaged) = read(write_sentence(body))
     assert (type(understood), understood, n_damaged) == (type(message), message, 0)
 
@@ -182,7 +182,7 @@ def test_sync_wrong_sums_are_counted():
 
 
 @given(st.lists(st.sampled_from(sorted(BODIES)), min_size=1, max_size=20), st.randoms(use_true_random=False))
-def test_lines_cut_anywhere_are_joined_again(bodies, random):
+def test_sync_split_lines_are_rejoined(bodies, random):
     data = b"".join(map(write_sentence, bodies))
     reader, messages = LineReader(), []
     while data:

@@ -110,7 +110,7 @@ def test_sketch_compiles_with_arduino_stub(compiler):
     assert checked.returncode == 0, checked.stderr
 
 
-def test_its_sentences_tell_every_second_of_the_calendar(host_board):
+def test_firmware_sentences_cover_the_calendar(host_board):
     rng = random.Random(0)
     # Two digits of a year before 1969 are one of this century to strptime.
     last = int(datetime(2068, 12, 31, tzinfo=timezone.utc).timestamp())
@@ -123,7 +123,7 @@ def test_its_sentences_tell_every_second_of_the_calendar(host_board):
     assert [rmc_utc_s(line) for line in done.stdout.split()] == seconds
 
 
-def test_it_introduces_itself_and_makes_a_pulse_per_second(virtual):
+def test_firmware_says_hello_and_sends_pps(virtual):
     messages = virtual(5.5)
     assert messages[0] == Hello(1, "1.0", "virtual")
     edges = of_kind(messages, PpsEdge)

@@ -39,13 +39,13 @@ def test_v4l2_absent_camera_is_named():
     assert "driver.device" in error.hint or "camera's cable" in error.hint
 
 
-def test_a_missing_device_setting_is_said():
+def test_v4l2_missing_device_setting_is_reported():
     error = refusal(None)
     assert error.what.startswith("cam:") and "profile" in error.what
     assert "this computer" in error.hint
 
 
-def test_what_is_no_camera_is_refused_by_name(tmp_path):
+def test_v4l2_device_without_capture_is_refused(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path / "file", tmp_path / "fifo", tmp_path, Path("/dev/null")):
@@ -177,7 +177,7 @@ def read(kernel, form, is_planar=False):
     )
 
 
-def test_images_come_whole_counted_and_stamped(kernel):
+def test_v4l2_images_are_complete_counted_timestamped(kernel):
     ran = read(kernel, "UYVY")
     assert ran.returncode == 0, ran.stderr
     said = json.loads(ran.stdout)

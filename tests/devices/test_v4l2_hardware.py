@@ -51,7 +51,7 @@ def take(samples, n):
     return [sample for sample in islice(samples, n) if isinstance(sample, Image)]
 
 
-def test_pictures_come_counted_stamped_and_in_order(device_name):
+def test_v4l2_images_are_counted_timestamped_ordered(device_name):
     with attached(V4l2Source("cam", camera(VIVID if device_name == "vivid" else {}))) as (source, samples):
         images = take(samples, 20)
         status = source.status()
@@ -83,7 +83,7 @@ def test_a_running_camera_is_busy_for_others():
         ({"read_only_integer_32_bits": 1}, "v4l2-ctl"),
     ],
 )
-def test_controls_it_cannot_take_are_refused_by_name(controls, hint, vivid):
+def test_v4l2_unsupported_controls_are_named(controls, hint, vivid):
     with (
         pytest.raises(SourceError, match=next(iter(controls))) as caught,
         attached(V4l2Source("cam", camera(controls))),
@@ -102,7 +102,7 @@ def test_controls_are_set_by_number(vivid):
     device.close()
 
 
-def test_all_formats_show_the_same_picture(vivid):
+def test_v4l2_all_formats_give_same_image(vivid):
     still = VIVID | {"test_pattern": 0, "brightness": 128}
     pictures = {}
     device = VideoDevice(DEVICE, "cam")
@@ -121,7 +121,7 @@ def test_all_formats_show_the_same_picture(vivid):
             assert np.mean(apart > 4) <= 0.05, code
 
 
-def test_a_camera_without_pulses_falls_silent(vivid):
+def test_v4l2_triggered_camera_without_pulses_is_silent(vivid):
     with attached(V4l2Source("cam", camera({"percentage_of_dropped_buffers": 100}), silence_s=1.5)) as (
         _,
         samples,

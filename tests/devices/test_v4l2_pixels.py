@@ -40,7 +40,7 @@ def encode(code, bgr, padding):
 
 @pytest.mark.parametrize("code", ["UYVY", "YUYV", "BGR3", "RGB3", "BGR4"])
 @pytest.mark.parametrize("padding", [0, 5])
-def test_a_colour_picture_comes_back(code, padding):
+def test_pixel_formats_colour_round_trips(code, padding):
     picture = smooth_picture()
     data, stride = encode(code, picture, padding)
     pixels = PixelDecoder(code, WIDTH, HEIGHT, stride).decode(data)
@@ -69,7 +69,7 @@ def test_deep_grey_keeps_its_upper_bits(code, bits):
     assert (PixelDecoder(code, WIDTH, HEIGHT, 2 * WIDTH + 6).decode(data) == grey).all()
 
 
-def test_left_aligned_bits_are_found_out_and_remembered():
+def test_left_aligned_bits_are_detected_once():
     decoder = PixelDecoder("Y12 ", WIDTH, HEIGHT)
     bright, dark = np.full((HEIGHT, WIDTH), 200 << 8, "<u2"), np.full((HEIGHT, WIDTH), 3 << 8, "<u2")
     assert (decoder.decode(bright.tobytes()) == 200).all()
@@ -86,7 +86,7 @@ def test_a_jpeg_is_decoded_and_must_have_the_size():
 
 
 @given(code=st.sampled_from(sorted(FORMATS)), width=st.integers(1, 20), padding=st.integers(0, 9))
-def test_exactly_the_declared_bytes_make_a_picture(code, width, padding):
+def test_image_needs_exactly_declared_bytes(code, width, padding):
     width, form = 2 * width, FORMATS[code]
     row = width * form.n_channels * (2 if form.bits > 8 else 1)
     decoder = PixelDecoder(code, width, 8, row + 2 * padding)

@@ -15,7 +15,7 @@ TIMES = st.integers(0, 40_000)
 
 
 @given(n_rows=ROWS, exposure_ns=TIMES, line_time_ns=TIMES, delay_ns=TIMES)
-def test_every_mark_leads_to_the_middle_of_the_middle_row(n_rows, exposure_ns, line_time_ns, delay_ns):
+def test_every_timestamp_moment_converts_to_mid_exposure(n_rows, exposure_ns, line_time_ns, delay_ns):
     starts = delay_ns + line_time_ns * np.arange(n_rows)  # after the trigger at 0
     reads = starts + exposure_ns
     middle = np.mean(starts + exposure_ns / 2)
@@ -39,7 +39,7 @@ def test_every_mark_leads_to_the_middle_of_the_middle_row(n_rows, exposure_ns, l
         ("trigger", 0x12000, "tegra-video", "trigger"),
     ],
 )
-def test_the_mark_comes_from_profile_flags_and_driver(mark, flags, driver, moment):
+def test_timestamp_moment_uses_profile_flags_and_driver(mark, flags, driver, moment):
     settings = DriverSettings(frame_timing=FrameTimingSettings(mark=mark))  # type: ignore[arg-type]
     assert stamped_moment(settings, flags, driver) == moment
 
@@ -58,7 +58,7 @@ NOW = {
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("age_ms", [0, 12, 199])
-def test_the_clock_of_the_stamps_is_found(clock, age_ms):
+def test_clock_of_timestamps_is_found(clock, age_ms):
     assert choose_clock(NOW[clock] - age_ms * MS, NOW) == (clock, 0)
 
 
@@ -67,13 +67,13 @@ def test_the_clock_of_the_stamps_is_found(clock, age_ms):
     [(age_ms, 0, (None, 0)) for age_ms in (-1, 201, 5000, -29_000)]
     + [(20, 1, ("monotonic", MS)), (20, 40, ("monotonic", 40 * MS))],
 )
-def test_clocks_that_fit_and_differ_are_told_from_none(age_ms, apart_ms, chosen):
+def test_ambiguous_clocks_are_distinguished_from_none(age_ms, apart_ms, chosen):
     now = NOW | ({"monotonic_raw": NOW["monotonic"] + apart_ms * MS} if apart_ms else {})
     assert choose_clock(NOW["monotonic"] - age_ms * MS, now) == chosen
 
 
 @pytest.mark.parametrize("clock", ["monotonic", "realtime"])
-def test_a_stamp_of_this_computers_clock_becomes_utc(clock):
+def test_host_clock_timestamp_becomes_utc(clock):
     before_ns, stamp_ns, after_ns = time.time_ns(), read_clocks()[clock], time.time_ns()
     stamps = StampClock()
     utc_ns = stamps.to_utc_ns(stamp_ns)
@@ -83,7 +83,7 @@ def test_a_stamp_of_this_computers_clock_becomes_utc(clock):
     assert stamps.problems() == []
 
 
-def test_stamps_that_fit_no_clock_give_none_and_a_problem():
+def test_timestamps_of_unknown_clock_are_a_problem():
     stamps = StampClock()
     assert stamps.to_utc_ns(read_clocks()["monotonic"] + 3600 * 1000 * MS) is None
     (problem,) = stamps.problems()
@@ -91,7 +91,7 @@ def test_stamps_that_fit_no_clock_give_none_and_a_problem():
     assert "monotonic -3600000 ms" in str(problem.figures["ages"])
 
 
-def test_stamps_that_leave_their_clock_are_followed():
+def test_timestamp_clock_change_is_followed():
     stamps = StampClock()
     stamps.to_utc_ns(read_clocks()["monotonic"])
     stamps.to_utc_ns(read_clocks()["realtime"])

@@ -194,12 +194,12 @@ def test_packets_of_another_address_are_named(lidar):
     assert HERE in error.hint and "driver.address" in error.hint
 
 
-def test_rubbish_on_the_port_is_counted_and_named(lidar):
+def test_vlp16_garbage_packets_are_counted(lidar):
     rubbish = [SensorPacket(velodyne.DATA_PORT, T0_NS, b"hello")] * 7
     assert "7 damaged packets" in explain(lidar, rubbish).what
 
 
-def test_a_port_that_another_program_holds_is_named(lidar):
+def test_vlp16_busy_port_is_named(lidar):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", lidar.driver.port))
         error = explain(lidar)

@@ -36,7 +36,7 @@ def davis(drift=-2.5e-05, offset_ns=3000000, n=20, **status):
     return seen
 
 
-def test_a_davis_is_fitted_to_the_edges_it_saw():
+def test_doctor_davis_clock_is_fitted_to_edges():
     exam = examination(davis(), sync_board(4.0, drift=0.0), rig=davis_rig())
     line = look(check_edges, exam, "cam")
     assert line is not None and line.severity == "note"
@@ -51,7 +51,7 @@ def test_davis_without_edges_is_an_error():
     assert (line.figures["n_edges"], line.figures["n_pulses"]) == (0, 20)
 
 
-def test_boards_may_move_where_every_clock_is_tied():
+def test_doctor_synchronised_clocks_allow_moving_boards():
     exam = examination(lidar(clock=LOCKED), camera(), with_utc(sync_board()))
     line = look(check_sync, exam)
     assert line is not None and (line.severity, codes(line)) == ("note", ["sync.boards_may_move"])
@@ -59,7 +59,7 @@ def test_boards_may_move_where_every_clock_is_tied():
     assert model.convert(START_NS + S) == pytest.approx(START_NS + S, abs=1000)
 
 
-def test_a_clock_that_is_not_tied_is_named_with_the_way_out():
+def test_doctor_unsynchronised_clock_has_action():
     line = look(check_sync, examination(lidar(clock=LOCKED), camera(), rig=make_rig(sync=None)))
     assert line is not None and line.severity == "warning"
     verdict, reason = line.findings
@@ -77,7 +77,7 @@ def test_no_sync_in_profile_is_a_note():
     assert line is not None and line.severity == "note" and codes(line)[0] == "sync.boards_must_stand"
 
 
-def test_absent_sensors_are_left_out_of_the_verdict():
+def test_doctor_absent_sensors_do_not_count_for_sync():
     absent = ObservedSensor("cam", failure=SourceError("it is not there"))
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 

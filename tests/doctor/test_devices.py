@@ -13,7 +13,7 @@ from lce_rig.rig import load_rig
 from .observed import S, camera, codes, examination, lidar, look, make_rig
 
 
-def test_what_does_not_open_is_red_with_what_to_check():
+def test_sensor_that_does_not_open_is_an_error_with_hint():
     seen = ObservedSensor(
         "cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it.")
     )
@@ -23,7 +23,7 @@ def test_what_does_not_open_is_red_with_what_to_check():
     assert look(check_stream, examination(seen), "cam") is None
 
 
-def test_driver_problems_stand_in_their_line():
+def test_driver_problems_are_in_the_sensors_line():
     status = {
         "device": "DAVIS346",
         "problems": (
@@ -44,7 +44,7 @@ def test_driver_problems_stand_in_their_line():
     ("rate_hz", "severity", "code"),
     [(10.0, "note", "stream.rate"), (20.0, "warning", "stream.rate_off"), (10.3, "note", "stream.rate")],
 )
-def test_the_rotors_rate_is_compared_with_the_profile(rate_hz, severity, code):
+def test_rotor_rate_is_compared_with_profile(rate_hz, severity, code):
     line = look(check_stream, examination(lidar(rate_hz, n_packets=3770)), "lidar")
     assert line.severity == severity and codes(line) == [code, "stream.complete"]
     assert line.figures["rate_hz"] == pytest.approx(rate_hz, rel=1e-3)
@@ -64,7 +64,7 @@ def test_losses_are_counted_and_judged_by_their_share(n_lost, severity):
     assert ("stream.losses" in codes(line)) == (n_lost > 0)
 
 
-def test_a_stream_that_stopped_before_the_end_is_red():
+def test_stopped_stream_is_an_error():
     seen = camera(duration_s=2.0)
     seen.ended_ns += 3 * S
     line = look(check_stream, examination(seen), "cam")
@@ -75,7 +75,7 @@ def test_a_stream_that_stopped_before_the_end_is_red():
     )
 
 
-def test_a_triggered_camera_without_pictures_is_red():
+def test_triggered_camera_without_images_is_an_error():
     line = look(check_stream, examination(camera(duration_s=0.0)), "cam")
     assert line is not None and line.severity == "error" and codes(line)[0] == "stream.none"
 
@@ -96,12 +96,12 @@ def test_disk_of_absent_folder_is_measured(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_red():
+def test_unwritable_folder_is_an_error():
     line = look(check_disk, Examination(make_rig(), Path("/proc")))
     assert line.severity == "error" and codes(line) == ["computer.disk_not_writable"]
 
 
-def test_the_clock_is_judged_by_the_kernel():
+def test_computer_clock_follows_kernel_state():
     line = look(check_computer_clock, Examination(make_rig()))
     code = "computer.clock" if line.severity == "note" else "computer.clock_not_synchronised"
     assert codes(line) == [code] and (line.severity == "note") == ("max_error_ms" in line.figures)

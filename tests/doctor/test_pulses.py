@@ -45,14 +45,14 @@ def test_ambiguous_pulses_are_counted():
     assert line is not None and line.severity == "error" and "pulses.unequal" in codes(line)
 
 
-def test_lost_frames_count_by_their_numbers():
+def test_lost_images_are_counted_by_sequence_number():
     seen = camera()
     seen.frames = [frame for frame in seen.frames if frame.count is not None and frame.count % 10]
     line = look(check_frames_of_pulses, examination(seen, sync_board()), "cam")
     assert line is not None and line.severity == "note"
 
 
-def test_the_boards_lines_are_held_against_the_profile():
+def test_sync_board_lines_are_compared_with_profile():
     line = look(check_pulses_sent, examination(sync_board()))
     assert line is not None and line.severity == "note"
     assert codes(line) == ["pulses.line_off", "pulses.line"]

@@ -11,7 +11,7 @@ def with_timestamps(**timestamps):
     return make_rig(lidars={"lidar": {"timestamps": {"reference": "first_firing", **timestamps}}})
 
 
-def test_a_locked_sensor_is_green_with_the_time_it_was_told():
+def test_locked_velodyne_is_a_note_with_time():
     line = look(check_pps, examination(lidar(clock=LOCKED)), "lidar")
     assert line is not None and line.severity == "note"
     assert codes(line) == ["clock.pulse", "clock.lidar_utc"]

@@ -134,7 +134,7 @@ def test_export_unconnected_gives_two_urdfs(three_sensor_rig, make, tmp_path):
         ([], []),
     ],
 )
-def test_frames_that_make_no_tree_are_refused(links, joints):
+def test_frames_without_tree_are_refused(links, joints):
     with pytest.raises(SessionError):
         RobotTree.of_joints("a.urdf", [Joint(parent, child, np.eye(4)) for parent, child in joints], links)
 
@@ -189,7 +189,7 @@ def test_exported_camera_files_are_read_back(rles, make, tmp_path, pattern, bloc
 
 @pytest.mark.parametrize("version", ["%YAML:1.0", "%YAML 1.2"])
 @pytest.mark.parametrize("extra, model", [("", "radtan"), ("fisheye_model: 1\n", "equidistant")])
-def test_a_lens_of_opencv_is_read(version, extra, model, tmp_path):
+def test_opencv_lens_is_read_back(version, extra, model, tmp_path):
     matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [ {} ]\n"
     text = version + "\n---\nimage_width: 640\nimage_height: 480\n" + extra
     text += "camera_matrix: " + matrix.format(3, 3, "500., 0., 320., 0., 501., 240., 0., 0., 1.")
@@ -214,7 +214,7 @@ def test_a_result_of_another_rig_is_refused(rles, make, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make, tmp_path):
+def test_kalibr_chain_links_successive_cameras(three_sensor_rig, make, tmp_path):
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
     findings = []

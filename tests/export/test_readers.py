@@ -21,7 +21,7 @@ def case(request, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("read_by", "reader"), READERS.items(), ids=[" by ".join(key) for key in READERS])
-def test_another_program_draws_the_same_points(case, read_by, reader):
+def test_other_program_projects_same_points(case, read_by, reader):
     assert off_px(case, read_by[0], reader) < 1e-6
 
 
@@ -71,7 +71,7 @@ def test_the_profile_names_the_formats_that_are_written():
     assert usual_formats(rig.model_copy(update={"exports": ("ply", "urdf")})) == ("ply", "urdf")
 
 
-def test_points_that_only_the_lidar_sees_get_no_colour(case):
+def test_points_outside_camera_view_have_no_colour(case):
     """A board at 1 m hides a part of the wall at 4 m from a camera beside the LiDAR, and not the rest."""
     T_cam_lidar = case.calibration.T_cam_lidar.copy()
     T_cam_lidar[:3, 3] = [0.3, 0.0, 0.0]

@@ -127,7 +127,7 @@ def test_robot_bag_tree_starts_below_joint(rles, make, tmp_path):
         pytest.param([[*ROBOT[:3], ("base_link", "davis_optical_frame", OPTICAL)]], id="optical elsewhere"),
     ],
 )
-def test_a_tree_that_does_not_fit_is_refused(rles, make, tmp_path, batches):
+def test_robot_bag_unfit_tree_is_refused(rles, make, tmp_path, batches):
     path = write_bag(tmp_path / "robot_mcap", batches)
     with pytest.raises(SessionError) as error:
         build_trees([make()], rles, read_robot_bag(path))

@@ -112,7 +112,7 @@ def test_deploy_unfit_result_needs_a_reason(result, rig, local, robot, changes, 
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
 
-def test_deploy_names_robot_or_takes_unknown(result, rig, local):
+def test_deploy_refuses_result_of_other_or_unnamed_robot(result, rig, local):
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
     unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))
@@ -169,7 +169,7 @@ class Meanwhile(Place):
         self._happens(Path(self.path) / name)
 
 
-def test_of_two_deployments_at_once_one_is_refused(result, rig, local, robot):
+def test_concurrent_deployment_is_refused(result, rig, local, robot):
     deploy(result("a"), rig, local)
     folder, other = result("b", 0.15), result("c", 0.16)
 
@@ -309,7 +309,7 @@ def test_deploy_link_to_device_is_replaced(result, rig, target, robot):
 
 @pytest.mark.realtime
 @pytest.mark.long
-def test_the_output_and_the_time_of_a_command_are_bounded(result, rig, target):
+def test_deploy_command_output_and_time_are_limited(result, rig, target):
     endless = with_settings(target, run="yes", run_timeout_s=2)
     with pytest.raises(CommandError) as caught:
         deploy(result("a"), rig, endless)

@@ -57,7 +57,7 @@ def test_a_session_returns_its_rows():
 
 @pytest.mark.realtime
 @pytest.mark.long
-def test_one_that_hangs_is_ended_at_its_time_limit():
+def test_hanging_session_ends_at_time_limit():
     start_s = time.monotonic()
     ended = act("hang", limit_s=8.0)
     assert (ended.rows, ended.status, ended.known) == (None, "timed_out", {"robot": "r1"})
@@ -65,12 +65,12 @@ def test_one_that_hangs_is_ended_at_its_time_limit():
 
 
 @pytest.mark.parametrize("way", ["gulp", pytest.param("eat", marks=pytest.mark.long)])
-def test_one_that_eats_memory_is_ended_at_its_limit(way):
+def test_session_ends_at_memory_limit(way):
     ended = act(way, limit_mb=700.0)
     assert (ended.rows, ended.status) == (None, "out_of_memory")
 
 
-def test_one_that_crashes_names_its_signal():
+def test_crashed_session_names_signal():
     assert act("crash").cause.figures["signal"] == signal.SIGSEGV
 
 
@@ -79,7 +79,7 @@ def test_a_bug_is_named_by_its_last_line():
     assert cause.code == "fleet.bug" and "ZeroDivisionError" in cause.text
 
 
-def test_the_session_ends_with_whoever_started_it(tmp_path):
+def test_session_process_ends_with_its_parent(tmp_path):
     (tmp_path / "acts_of_sessions.py").write_text(
         "import os, pathlib, time\n"
         "def hang(arguments, tell):\n"

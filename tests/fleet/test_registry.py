@@ -59,7 +59,7 @@ def test_registry_later_result_replaces(registry, row):
     assert registry.folders() == ["r1/new"]
 
 
-def test_what_a_new_result_in_the_same_folder_lacks_is_kept(registry, row):
+def test_registry_keeps_files_missing_in_new_result(registry, row):
     write(registry, row(folder="r1/a"), "same.txt", "result.json")
     (registry.place.local / "r1/a/notes.txt").write_text("mine")
     write(registry, row(folder="r1/a"))
@@ -94,7 +94,7 @@ def test_registry_failed_write_keeps_folder(registry, row):
         '{"format_version": 1, "rows": 1}',
     ],
 )
-def test_a_damaged_file_costs_its_session_only(registry, row, content):
+def test_registry_damaged_file_affects_only_its_session(registry, row, content):
     """Where a row says ok, result.json is damaged."""
     folder = "r1/20260105T100000Z-0123456789ab"
     write(registry, row(folder=folder), "result.json")

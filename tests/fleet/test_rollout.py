@@ -89,7 +89,7 @@ def test_every_robot_gets_its_own_newest_result(registry, targets, add):
 
 
 @pytest.mark.usefixtures("whole")
-def test_a_robot_whose_newest_session_failed_is_left_out(registry, targets, add):
+def test_rollout_skips_robot_with_failed_session(registry, targets, add):
     add("r2", "2026-02-01T10:00:00Z", verdict="fail")
     add("r3", "2026-02-01T10:00:00Z", status="failed", cause="fleet.session")
     rollout = deploy(registry, targets)
@@ -98,7 +98,7 @@ def test_a_robot_whose_newest_session_failed_is_left_out(registry, targets, add)
 
 
 @pytest.mark.usefixtures("whole")
-def test_the_first_failure_stops_and_the_same_call_goes_on(registry, targets):
+def test_rollout_stops_at_failure_and_resumes(registry, targets):
     robots = targets.parent / "robots"
     (robots / "r2" / "broken").touch()
     rollout = deploy(registry, targets)

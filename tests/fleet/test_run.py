@@ -47,7 +47,7 @@ def test_fleet_run_every_session_has_a_row(fleet_root, tmp_path, client):
     assert contents(fleet_root) == before, "nothing below the root is written"
 
 
-def test_what_is_done_is_not_done_again(fleet_root, tmp_path, client):
+def test_fleet_run_skips_finished_sessions(fleet_root, tmp_path, client):
     shutil.rmtree(fleet_root / "r2/torn")
     place = tmp_path / "registry"
     first, registry = run(fleet_root, place, client)
@@ -66,7 +66,7 @@ def test_what_is_done_is_not_done_again(fleet_root, tmp_path, client):
     assert (other.n_new, set(other.table["method"].to_pylist())) == (2, {"paper"})
 
 
-def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):
+def test_fleet_run_limits_end_only_their_session(fleet_root, tmp_path):
     (job,) = [job for job in find_jobs(Storage.at(fleet_root)) if job.source.endswith("r1/monday")]
     for limits, status in (
         ({"time_limit_s": 0.3}, "timed_out"),

@@ -50,7 +50,7 @@ def test_targets_empty_file_gets_own_advice(tmp_path, text):
         ("./a:b", None, "./a:b"),
     ],
 )
-def test_places_are_read_as_scp_reads_them(to, host, path):
+def test_targets_have_scp_syntax(to, host, path):
     target = TargetSettings(to=to)
     assert (target.host, target.path) == (host, path)
 
@@ -86,7 +86,7 @@ def test_targets_shell_words_are_refused(tmp_path, text):
         read_targets(path)
 
 
-def test_arguments_reach_the_script_as_they_are(tmp_path):
+def test_place_passes_arguments_unchanged(tmp_path):
     words = Place(TargetSettings(to="kestrel:c", ssh={"Port": 2222})).command("echo $2", "it's; $(reboot)")
     assert words[0] == "ssh" and "Port=2222" in words and "BatchMode=yes" in words
     assert words[-2] == "kestrel"
@@ -94,7 +94,7 @@ def test_arguments_reach_the_script_as_they_are(tmp_path):
 
 
 @pytest.mark.long
-def test_a_computer_that_is_not_there_is_an_error_in_words():
+def test_place_unreachable_host_is_explained():
     with pytest.raises(TargetError) as caught:
         standing(TargetSettings(to="robot@127.0.0.1:c", ssh={"Port": 1}))
     assert "no connection" in caught.value.what and caught.value.exit_code == 8

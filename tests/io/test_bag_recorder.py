@@ -16,7 +16,7 @@ from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_e
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_samples_come_back_as_they_were(tmp_path, rles, name):
+def test_bag_recorder_samples_round_trip(tmp_path, rles, name):
     samples = one_second()
     path = record(tmp_path / name, rles, samples)
     images, scans = read(path, rles)
@@ -55,7 +55,7 @@ def test_stamps_mark_the_firing_that_the_profile_says(tmp_path, rles, has_times)
 
 
 @pytest.mark.parametrize("path", ["no/folder/r.bag", "file/r"])
-def test_places_where_no_bag_can_be_are_refused(tmp_path, rles, path):
+def test_bag_recorder_invalid_folder_is_refused(tmp_path, rles, path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(SourceError, match=path):
         BagRecorder(tmp_path / path, rles)
@@ -84,7 +84,7 @@ def test_bag_recorder_refuses_unknown(tmp_path, rles):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_memory_stays_flat_however_long_it_records(tmp_path, rles, name):
+def test_bag_recorder_memory_is_bounded(tmp_path, rles, name):
     image, scan, events = picture(0), sweep(0), packet(0)
     with BagRecorder(tmp_path / name, rles) as recorder:
         recorder.write(image)

@@ -51,7 +51,7 @@ def test_compare_beams_of_another_model_names_it(recorded, profile, names):
     assert f"lidars.lidar.model to {names}" in finding.sentence
 
 
-def test_beams_of_a_unit_are_no_other_model():
+def test_compare_beams_accepts_unit_deviations():
     """Nor are unseen rings."""
     rng = np.random.default_rng(1)
     for model in ("OS1-64", "VLP-16"):

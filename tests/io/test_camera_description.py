@@ -237,7 +237,7 @@ def test_size_zero_is_that_of_the_images():
         ("", (0, 0, 0, 0, 0), ()),
     ],
 )
-def test_zeros_at_the_end_are_the_model_they_equal(model, given, used):
+def test_trailing_zero_coefficients_select_shorter_model(model, given, used):
     assert described(model=model, distortion=given).intrinsics(SIZE)[0].distortion == used
 
 

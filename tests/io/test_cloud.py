@@ -215,7 +215,7 @@ def test_every_point_gets_the_number_of_its_laser(elevations_deg):
     np.testing.assert_array_equal(rings_from_elevation(points), laser)
 
 
-def test_a_laser_that_sees_little_keeps_its_own_ring():
+def test_laser_with_few_returns_keeps_its_ring():
     points, laser = sweep(VLP16_DEG)
     keep = (laser < 13) | (np.arange(len(laser)) % 97 == 0)
     ring = rings_from_elevation(points[keep])
@@ -223,6 +223,6 @@ def test_a_laser_that_sees_little_keeps_its_own_ring():
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_a_cloud_of_hardly_any_points_has_no_rings_to_tell(n):
+def test_cloud_of_few_points_has_no_rings(n):
     with pytest.raises(SourceError):
         rings_from_elevation(np.array([[3.0, 1.0, 0.2], [5.0, 2.0, 1.9]])[:n])

@@ -59,7 +59,7 @@ def test_davis_file_frames_need_a_channel(tmp_path, rles):
     assert has_note(recording.notes, "frames skipped", "davis", "no channel")
 
 
-def test_frames_out_of_order_are_left_out_and_counted(tmp_path, rles):
+def test_davis_file_unordered_images_are_skipped_and_counted(tmp_path, rles):
     path = write_davis(
         tmp_path / "a.aedat4",
         PIECES,
@@ -76,7 +76,7 @@ def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path, rles, name):
     assert len(events_of(opened(tmp_path / name, rles))) == len(EVENTS)
 
 
-def test_serial_numbers_in_heads_of_files_are_told(tmp_path, rles):
+def test_event_file_serial_numbers_are_reported(tmp_path, rles):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS], "DAVIS346_00000499")
     local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
     head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"

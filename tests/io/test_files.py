@@ -30,14 +30,14 @@ def smooth():
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".ppm", ".PNG"])
-def test_lossless_pictures_are_read_exactly(tmp_path, smooth, suffix):
+def test_lossless_images_are_read_exactly(tmp_path, smooth, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(cv2.imencode(suffix.lower(), smooth)[1].tobytes())
     assert np.array_equal(read_image(path), smooth)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".pgm", ".bmp", ".tiff"])
-def test_grey_pictures_stay_grey(tmp_path, smooth, suffix):
+def test_grey_images_stay_grey(tmp_path, smooth, suffix):
     path = tmp_path / f"a{suffix}"
     cv2.imwrite(str(path), smooth[..., 0])
     assert np.array_equal(read_image(path), smooth[..., 0])
@@ -61,7 +61,7 @@ def test_deep_pictures_keep_their_contrast(tmp_path, smooth):
 
 
 @pytest.mark.parametrize("name", ["gone.png", "text.png", "gone.pcd", "folder.ply"])
-def test_missing_and_foreign_files_are_named(tmp_path, name):
+def test_missing_and_unreadable_files_are_named(tmp_path, name):
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(SourceError, match=name):

@@ -124,7 +124,7 @@ def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
         open_recording(path, TWO, SourceOptions(camera="right"))
 
 
-def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
+def test_folder_images_of_one_name_are_two_pairs(make_folder, rig):
     path = make_folder()
     shutil.copy(path / "img" / "00000.png", path / "img" / "00000.bmp")
     assert [len(pair.read()[0]) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
@@ -181,7 +181,7 @@ def test_names_are_paired_by_the_first_method_that_fits(images, clouds, how, pai
     ("images", "clouds", "may_count"),
     [(["a1", "a2", "a3"], ["b1", "b2"], True), (["a1"], ["b1"], False), (["1.5"], ["9.5"], False)],
 )
-def test_nothing_is_paired_by_guesswork(images, clouds, may_count):
+def test_folder_ambiguous_names_are_not_paired(images, clouds, may_count):
     with pytest.raises(SourceError):
         pair_names(images, clouds, may_count=may_count)
 

@@ -123,7 +123,7 @@ def test_join_key_ignores_the_order(rles):
         (400_000.0, ["one computer's"]),
     ],
 )
-def test_clocks_that_do_not_overlap_are_said_by_how_much(rles, after_s, words):
+def test_join_non_overlapping_clocks_state_the_gap(rles, after_s, words):
     joined = JoinedRecording([lidar(), camera(after_s=after_s)], rles)
     passed = []
     with pytest.raises(SourceError) as caught:
@@ -162,7 +162,7 @@ def packet(t_ns, host_ns=None):
     return Events("davis", t_ns, zeros, zeros, zeros > 0, 346, 260, host_ns)
 
 
-def test_a_part_that_is_torn_does_not_end_the_others(rles):
+def test_join_torn_part_keeps_the_others(rles):
     torn = lidar(torn="lidar.bag is damaged")
     found = []
     with pytest.raises(SourceError, match=r"lidar\.bag"):

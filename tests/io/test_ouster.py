@@ -40,7 +40,7 @@ def write_metadata(path, profile, **changes):
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_points_are_those_of_ousters_own_library(tmp_path, profile):
+def test_ouster_points_match_vendor_library(tmp_path, profile):
     metadata = write_metadata(tmp_path / "metadata.json", profile)
     payload = KEPT[f"{profile}_packet"].tobytes()
     assert metadata.packet.itemsize == len(payload)
@@ -93,7 +93,7 @@ def write_pcap(path, metadata, n_frames, range_m=4.0):
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_pcap_gives_one_scan_a_frame(tmp_path, rig, profile):
+def test_ouster_pcap_gives_one_scan_per_frame(tmp_path, rig, profile):
     metadata = write_metadata(tmp_path / "drive.json", profile)
     write_pcap(tmp_path / "drive.pcap", metadata, 2.25)
     recording = open_recording(tmp_path / "drive.pcap", rig, SourceOptions(is_part=True))
@@ -110,7 +110,7 @@ def test_a_pcap_gives_one_scan_a_frame(tmp_path, rig, profile):
     assert scan.offset_ns.max() == pytest.approx(10**8, rel=0.01)
 
 
-def test_what_is_missing_or_not_read_is_named(tmp_path, rig):
+def test_ouster_missing_or_unsupported_is_named(tmp_path, rig):
     path = tmp_path / "drive.pcap"
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 0.1)
     with pytest.raises(SourceError):

@@ -104,7 +104,7 @@ def test_every_link_type_gives_the_same_scans(name, frames, rig, tmp_path):
     check_scans(read(path, rig)[0])
 
 
-def test_wiresharks_own_format_is_read(frames, rig, tmp_path):
+def test_pcapng_is_read(frames, rig, tmp_path):
     check_scans(read(write_pcapng(tmp_path / "a.pcapng", frames), rig)[0])
 
 
@@ -115,7 +115,7 @@ def test_pcap_datagrams_are_read_back(datagrams, tmp_path):
     assert [vars(datagram) for datagram in back] == [vars(datagram) for datagram in datagrams]
 
 
-def test_notes_say_what_was_taken_and_what_the_stamps_are(frames, rig, tmp_path):
+def test_pcap_notes_state_sensor_and_clock(frames, rig, tmp_path):
     lossy = frames[:100] + frames[110:]
     n_lost = sum(len(frame) > 1206 for _, frame in frames[100:110])  # the others are of the LiDAR's state
     _, notes = read(write_pcap(tmp_path / "a.pcap", lossy), rig)
@@ -123,7 +123,7 @@ def test_notes_say_what_was_taken_and_what_the_stamps_are(frames, rig, tmp_path)
     assert 0 < n_lost <= 10 and has_note(notes, f"{n_lost} data packets", "lost")
 
 
-def test_a_torn_file_is_read_up_to_where_it_is_torn(frames, rig, tmp_path):
+def test_pcap_torn_file_is_read_to_the_tear(frames, rig, tmp_path):
     whole = write_pcap(tmp_path / "a.pcap", frames).read_bytes()
     torn = tmp_path / "torn.pcap"
     for end, note in ((len(whole) - 1, "cut short"), (len(whole) - 1255, "read up to byte")):
@@ -166,14 +166,14 @@ def test_pcap_damaged_gives_source_error(suffix, frames, rig, tmp_path, data):
     ],
     ids=["empty", "text", "packed", "torn header", "no frames", "wireless", "pcapng of a wireless card"],
 )
-def test_recordings_of_no_wired_network_are_refused(content, rig, tmp_path):
+def test_pcap_of_other_link_types_is_refused(content, rig, tmp_path):
     path = tmp_path / "a.pcap"
     path.write_bytes(content)
     with pytest.raises(SourceError, match=path.name):
         read(path, rig)
 
 
-def test_of_several_sensors_the_profiles_is_taken(datagrams, rig, tmp_path):
+def test_pcap_uses_the_profiles_sensor(datagrams, rig, tmp_path):
     both = [
         (d.host_ns, build_frame(Datagram(d.host_ns, source, d.port, d.port, d.payload)))
         for d in datagrams

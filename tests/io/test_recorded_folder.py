@@ -134,7 +134,7 @@ def test_recorded_images_join_packets(tmp_path, rlfs, paths):
     assert any(".350000.jpg" in note for note in joined.notes)
 
 
-def test_two_days_of_pictures_and_packets_stay_apart(tmp_path, rlfs):
+def test_recorded_folder_separates_two_days(tmp_path, rlfs):
     for day in ("monday", "tuesday"):
         fill_with_pictures(tmp_path / day)
     for file in (tmp_path / "tuesday/webcam").iterdir():

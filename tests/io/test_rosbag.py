@@ -98,7 +98,7 @@ def _as_mosaic(bgr, pattern):
     ["mono8", "8UC1", "bgr8", "8UC3", "rgb8", "bgra8", "rgba8", "yuv422", "uyvy", "yuv422_yuy2", "mono16"]
     + [f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")],
 )
-def test_pictures_of_any_encoding_look_the_same(
+def test_bag_images_of_all_encodings_are_equal(
     tmp_path, rig, room, write_bag, cloud_message, image_message, encoding
 ):
     # Colours that change slowly, so that mosaics and half the chroma lose next to nothing.
@@ -198,7 +198,7 @@ def test_bag_backward_times_are_skipped(
     assert has_note(recording.notes, LIDAR, "2")
 
 
-def test_a_clock_that_is_set_back_starts_again(tmp_path, rig, write_bag, stream):
+def test_bag_clock_set_back_restarts_order(tmp_path, rig, write_bag, stream):
     messages = [*stream(3)]
     hour_ns = 3600 * 10**9
     earlier = stream(3, t0_ns=T0_NS - hour_ns)

@@ -70,7 +70,7 @@ def test_velodyne_losses_follow_the_counter(packets):
     assert share == pytest.approx(len(only_data(kept)) / len(only_data(packets)), abs=0.01)
 
 
-def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets):
+def test_velodyne_scan_with_most_packets_lost_is_skipped(packets):
     gap = slice(90, 135)
     stream = stream_of()
     scans = push(stream, packets[: gap.start] + packets[gap.stop :])
@@ -78,7 +78,7 @@ def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets):
     assert stream.losses.n("packet.lost") == len(only_data(packets[gap]))
 
 
-def test_packets_sent_twice_or_late_change_nothing(packets):
+def test_velodyne_duplicate_or_late_packets_change_nothing(packets):
     arrived = list(packets)
     arrived.insert(50, packets[40])
     arrived.insert(200, packets[198])
@@ -115,14 +115,14 @@ def test_a_change_to_dual_returns_is_followed(packets):
     "controls",
     [{"rpm": 600}, {"position_port": "8308"}, {"position_port": 0}, {"cut_deg": True}, {"cut_deg": 500.0}],
 )
-def test_what_cannot_be_meant_is_refused_with_its_key(controls):
+def test_velodyne_implausible_settings_are_refused(controls):
     driver = DriverSettings.model_validate({"controls": controls})
     with pytest.raises(SourceError, match=next(iter(controls))):
         read_controls("lidar", settings(driver=driver))
 
 
 @pytest.mark.parametrize("cut_deg", [-90, 0, 37.5])
-def test_the_seam_lies_where_the_profile_wants_it(cut_deg):
+def test_velodyne_seam_follows_profile(cut_deg):
     driver = DriverSettings(controls={"cut_deg": cut_deg})
     stream = Vlp16Stream("lidar", settings(driver=driver))
     scans = push(stream, packets_of(room_scans(4)))
@@ -134,7 +134,7 @@ def test_the_seam_lies_where_the_profile_wants_it(cut_deg):
         assert np.ptp(azimuth_deg) == pytest.approx(359.8, abs=0.4)
 
 
-def test_time_goes_on_over_the_full_hour():
+def test_velodyne_time_continues_over_the_hour():
     truth = room_scans(6, T0_NS - T0_NS % HOUR_NS + HOUR_NS - 250_000_000)
     stream = stream_of()
     scans = push(stream, packets_of(truth))
@@ -179,7 +179,7 @@ def test_arrivals_that_waited_do_not_shift_stamps():
     assert late_ns.min() > -1000 and late_ns[1:].max() < 300_000
 
 
-def test_position_packets_that_lack_or_stop_end_the_trust(packets):
+def test_velodyne_without_position_packets_is_unsynchronised(packets):
     stream = stream_of()
     assert len(push(stream, only_data(packets))) == 5
     assert stream.clock.state().code == "clock.no_position_packets"
@@ -190,7 +190,7 @@ def test_position_packets_that_lack_or_stop_end_the_trust(packets):
     assert stream.clock.state().code == "clock.position_packets_stopped"
 
 
-def test_the_profile_may_want_the_hosts_time(packets):
+def test_velodyne_profile_may_select_host_time(packets):
     stream = stream_of(timestamps=TimestampSettings(reference="first_firing", clock="host"))
     scans = push(stream, packets)
     assert stream.clock.state().code == "clock.host_wanted"
@@ -212,7 +212,7 @@ def test_ranges_beyond_the_profiles_limits_give_no_points(packets):
     assert np.all(np.diff(near.offset_ns) > 0)
 
 
-def test_of_two_returns_the_brighter_one_is_kept():
+def test_velodyne_dual_return_keeps_brighter_one():
     front = room_scan(T0_NS, dropout=0.0)
     behind = room_scan(T0_NS, scale=1.5, dropout=0.0)
     # The last return is brighter in every other firing, and alone in the last hundred.
@@ -288,7 +288,7 @@ def test_position_packet_is_read_or_refused(payload):
         (b"\xff" * 306, None),
     ],
 )
-def test_only_sound_sentences_tell_the_time(sentence, second):
+def test_velodyne_only_valid_sentences_set_time(sentence, second):
     body = bytearray(velodyne.POSITION_BYTES)
     body[0xCE : 0xCE + len(sentence)] = sentence
     assert read_position_packet(bytes(body)).nmea_s == second

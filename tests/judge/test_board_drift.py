@@ -46,11 +46,11 @@ def test_board_drift_hidden_rotation_is_seen() -> None:
         assert "scene.board_changed_jointly" in [finding.code for finding in board.findings]
 
 
-def test_extrinsics_that_hold_are_not_doubted_jointly() -> None:
+def test_board_drift_unchanged_extrinsics_pass() -> None:
     for seed in range(6):
         board = watched(deployed(np.zeros(6)), seed)
         assert (board.joint.is_changed, board.joint.axes) == (False, ())
-        # What boards cannot see is a note.
+        # Directions that boards do not determine are a note.
         assert [f.severity for f in board.findings if f.code == "scene.board_hides"] == ["note"]
 
 

@@ -1,4 +1,4 @@
-"""Two cameras before the same boards: silent where both are sound, outspoken where one was moved."""
+"""Two cameras with the same boards: no finding if both are right, a finding if one was moved."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
 
 
 def observed(session):
-    """Pair both cameras' boards as a calibration would, whose consensus is not what is tested."""
+    """Pair both cameras' boards as a calibration would; its consensus is tested elsewhere."""
     return list(zip(session[LEFT], session[RIGHT], strict=True))
 
 
@@ -50,7 +50,7 @@ def test_images_pose_error_fits_covariance(sound):
 
 
 @pytest.mark.long
-def test_sound_sessions_are_not_questioned(sound):
+def test_consistent_sessions_have_no_findings(sound):
     for session in sound:
         pair = related(session)
         assert len(pair.captures) == 12
@@ -74,14 +74,14 @@ def test_images_nudged_camera_is_found(seed, nudge, figure, size):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_stale_extrinsics_contradict_images(seed):
-    """An extrinsic made before the camera was turned, captures of both from after it."""
+    """Extrinsics from before the camera was rotated, and captures of both cameras from after it."""
     session = simulate_two(12, seed)
     left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
     stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
     (apart,) = findings(relate(left, stale))
     assert apart.code == "verdict.cameras_differ"
     assert apart.subject.split(" to ") == [LEFT, RIGHT]
-    # Boards lie 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
+    # Boards are 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
     assert 0.025 < apart.figure("rms_m") < 0.055
 
 
@@ -97,7 +97,7 @@ def test_scaled_lens_scatters_the_boards(sound):
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
 
 
-def test_a_board_seen_wrongly_hardly_matters(sound):
+def test_camera_pair_outlier_board_hardly_matters(sound):
     session = observed(sound[1])
     left, right = session[3]
     wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
@@ -107,7 +107,7 @@ def test_a_board_seen_wrongly_hardly_matters(sound):
     assert np.linalg.norm(error[:3]) < 0.003
 
 
-def test_few_boards_tell_nothing_and_none_no_pair(sound):
+def test_camera_pair_of_few_boards_is_not_judged(sound):
     session = sound[2]
     assert pose_from_images(observed(session)[:3]) is None
     left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)

@@ -1,4 +1,4 @@
-"""The parts of the reported covariance: the profile's errors, and what checks contradict."""
+"""Parts of the reported covariance: errors of the profile, and contradictions."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def test_the_squares_of_the_contributions_add_up(sound):
         (CAMERA, replace(BOARD, square_m=1.02 * BOARD.square_m), "contradiction_scale"),
     ],
 )
-def test_a_wrong_profile_leaves_the_error_within_the_claim(lens, board, expected):
+def test_wrong_profile_error_is_within_covariance(lens, board, expected):
     estimate, examination = validated(lens, board)
     assert expected in sources(examination)
     error = difference(in_use(estimate.T_cam_lidar, estimate.lens.intrinsics), T_FORWARD)

@@ -1,4 +1,4 @@
-"""Two cameras whose images came under each other's name do not pass."""
+"""Two cameras with exchanged images do not pass."""
 
 from dataclasses import replace
 from pathlib import Path

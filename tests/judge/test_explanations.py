@@ -113,7 +113,7 @@ def test_explain_drift_is_named():
     ("angle_deg", "first"),
     [(0.8, 8), pytest.param(3.0, 13, marks=pytest.mark.long), pytest.param(5.0, 2, marks=pytest.mark.long)],
 )
-def test_explain_moved_tells_size_and_capture(angle_deg, first):
+def test_explain_moved_reports_size_and_capture(angle_deg, first):
     found, *_ = explained(
         moved(observed(16, 4), lambda k: k >= first, [0, 0, 0, np.radians(angle_deg), 0, 0])
     )
@@ -121,7 +121,7 @@ def test_explain_moved_tells_size_and_capture(angle_deg, first):
     assert tangent_sizes(found.change)[0] == pytest.approx(angle_deg, abs=0.1 if 4 < first < 12 else 0.4)
 
 
-def test_explain_range_offset_tells_size():
+def test_explain_range_offset_reports_size():
     found, *_ = explained(longer(offset_m=0.06)(observed(16, 5)))
     assert found.after.state.lasers[0].mean() == pytest.approx(0.06, abs=0.012)
 
@@ -137,7 +137,7 @@ def test_explain_scattered_images_is_no_moved_sensor():
 
 
 def test_explain_level_of_noise_does_not_hide_a_move():
-    """A noise fitted to captures that moved would widen until it held the move."""
+    """Noise fitted to captures that moved would grow until it explains the move."""
     observations = moved(observed(16, 7), lambda k: k >= 8, [0, 0, 0, np.radians(0.3), 0, 0])
     (found,) = explained(observations)
     assert found.gain.cause == "moved"
@@ -146,7 +146,7 @@ def test_explain_level_of_noise_does_not_hide_a_move():
 
 @pytest.mark.long
 def test_table_chances_of_sound_captures_are_uniform():
-    """A tenth of the chances of an error that is not there lies below a tenth."""
+    """Of the chances of an absent error, one in ten is below 0.1."""
     chances = []
     for seed in range(30):
         observations = observed(14, 100 + seed)

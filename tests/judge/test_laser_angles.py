@@ -31,7 +31,7 @@ def read_by_other_table(lidar: LidarBoard, azimuth: Array, elevation: Array) -> 
     ("azimuth", "elevation", "cause"),
     [
         (IN_TURN, 0 * OF_RING, "azimuths"),
-        # Hardly told from a LiDAR that is turned about its way forward.
+        # Hardly distinguishable from a rotation of the LiDAR about its forward axis.
         (2 * OF_RING, 0 * OF_RING, "azimuths"),
         (0 * OF_RING, IN_TURN, "elevations"),
         (0 * OF_RING, HALF_DEG * (2 * np.linspace(-1, 1, 16) ** 2 - 1), "elevations"),

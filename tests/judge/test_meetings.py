@@ -1,4 +1,4 @@
-"""Boards that moved between picture and sweep are held against the extrinsic as if they had not."""
+"""Moving boards are compared with the extrinsics after motion compensation."""
 
 import numpy as np
 import pytest
@@ -54,14 +54,14 @@ def planes_m(observations: list[Observation]) -> Array:
 
 
 @pytest.mark.parametrize("channel", ["frames", "events"])
-def test_planes_meet_once_the_motion_is_taken_off(
+def test_planes_meet_after_motion_compensation(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
     meetings = bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS)
     assert list(meetings) == [o.capture for o in observations[channel]]
     together = planes_m([meeting.at_scan_time for meeting in meetings.values()])
     apart = planes_m([meeting.measured for meeting in meetings.values()])
-    # 10 mm is the range noise; a board at 0.3 m/s per axis is seen up to 0.1 s apart.
+    # 10 mm is the range noise; a board at 0.3 m/s per axis is captured up to 0.1 s apart.
     assert np.sqrt(np.mean(together**2)) < 0.014 < np.sqrt(np.mean(apart**2))
 
 

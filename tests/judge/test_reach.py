@@ -1,4 +1,4 @@
-"""What a covariance means for points is what drawing extrinsics from it gives."""
+"""Point uncertainties from a covariance equal those from sampled extrinsics."""
 
 from dataclasses import replace
 

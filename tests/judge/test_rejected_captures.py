@@ -1,4 +1,4 @@
-"""Rejected captures that agree on another mounting are no outliers."""
+"""Rejected captures that agree on another mounting are not outliers."""
 
 from dataclasses import replace
 

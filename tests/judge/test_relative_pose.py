@@ -10,7 +10,7 @@ T_SECOND, T_FIRST = (
 )
 
 
-def test_derivatives_are_those_of_differences() -> None:
+def test_relative_pose_derivatives_match_differences() -> None:
     _, J = relative_pose(T_SECOND, T_FIRST)
     for axis in range(12):
         tangent = 1e-6 * np.eye(12)[axis]
@@ -21,7 +21,7 @@ def test_derivatives_are_those_of_differences() -> None:
         assert np.allclose(J[..., axis], difference(*moved) / 2e-6, atol=1e-7)
 
 
-def test_the_covariance_is_that_of_samples() -> None:
+def test_relative_pose_covariance_matches_samples() -> None:
     T, J = relative_pose(T_SECOND[0], T_FIRST[0])
     roots = 1e-3 * RNG.standard_normal((2, 6, 6))
     covs = roots @ np.swapaxes(roots, 1, 2)

@@ -1,4 +1,4 @@
-"""Repeated calibrations: sound ones agree, an odd one is named, and the finding says by how much."""
+"""Repeated calibrations: correct ones agree, and an outlier is reported with its difference."""
 
 from dataclasses import replace
 
@@ -23,13 +23,13 @@ def calibration(T, cov=COV, **diagnostics) -> Calibration:
 
 
 def sessions(n, seed, factor=1.0, cov=COV):
-    """Calibrations scattered by `factor` times what their covariance says."""
+    """Draw calibrations scattered by `factor` times their covariance."""
     rng = np.random.default_rng(seed)
     root = factor * np.linalg.cholesky(cov)
     return {f"day{k}": calibration(perturb(TRUTH, root @ rng.standard_normal(6)), cov) for k in range(n)}
 
 
-def test_sound_calibrations_spread_as_their_covariance_says():
+def test_repeat_spread_matches_covariance():
     compared = [compare_calibrations(sessions(3, seed)) for seed in range(100)]
     chi2 = np.array([one.chi2 for one in compared])
     assert all(one.dof == 12 for one in compared)
@@ -56,7 +56,7 @@ def test_repeat_lens_turn_is_no_difference():
     assert same_lens.max_rotation_deg == pytest.approx(np.degrees(np.linalg.norm(turn)), rel=1e-6)
 
 
-def test_uncertainties_that_are_too_small_are_found_out():
+def test_repeat_detects_optimistic_uncertainty():
     compared = compare_calibrations(sessions(4, 2, factor=4.0))
     assert not compared.agrees
     assert compared.ratio == pytest.approx(4, rel=0.4)
@@ -91,7 +91,7 @@ def test_repeat_same_captures_mostly_agree(correlation):
         }
         compared = compare_calibrations(group, are_independent=False)
         n_refused += not compared.agrees
-    # Opposite errors reach the bound: one of a hundred, within 3 sigma of the count.
+    # Errors of opposite sign reach the bound in 1 % of cases; allow 3 sigma of the count.
     assert n_refused <= 3 + 3 * np.sqrt(3)
 
 

@@ -51,7 +51,7 @@ def examined(estimate, lens=CAMERA):
 
 @pytest.fixture(scope="module")
 def verdict_of(estimate):
-    """Judge a changed estimate by what the checks found on the sound one."""
+    """Judge a changed estimate with the checks of the unchanged one."""
 
     def judged(changed, n_captures=20, rig=RIG):
         cov = changed.cov
@@ -65,7 +65,7 @@ def examined_verdict_of(estimate, lens=CAMERA):
     return judge(estimate, examined(estimate, lens), RIG, "cam", "lidar", len(estimate.used))
 
 
-def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
+def test_consistent_result_passes_without_reasons(estimate, verdict_of):
     assert verdict_of(estimate) == ("pass", ())
 
 
@@ -83,7 +83,7 @@ def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
         ),
     ],
 )
-def test_what_one_check_finds_decides_and_is_named(estimate, verdict_of, change, verdict, code, figures):
+def test_single_failed_check_decides_verdict(estimate, verdict_of, change, verdict, code, figures):
     if "diagnostics" in change:
         change = {"diagnostics": replace(estimate.diagnostics, **change["diagnostics"])}
     if "residuals" in change:
@@ -93,7 +93,7 @@ def test_what_one_check_finds_decides_and_is_named(estimate, verdict_of, change,
     assert reasons[0].figures == pytest.approx(figures)
 
 
-def test_few_usable_captures_of_many_are_a_doubt(estimate, verdict_of):
+def test_few_usable_captures_lower_the_verdict(estimate, verdict_of):
     verdict, reasons = verdict_of(estimate, n_captures=50)
     assert verdict == "marginal" and reasons[0].figures == {"n_used": 20, "n_captures": 50}
 
@@ -170,7 +170,7 @@ def test_nominal_inverted_as_a_matrix_is_corrected(estimate, verdict_of):
     assert len(reasons[0].figures["enter_quaternion_wxyz"]) == 4
 
 
-def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of):
+def test_many_captures_with_disagreeing_sensors_lower_the_verdict(estimate, verdict_of):
     refused = {f"x{k}": Refusal("pair.no_candidate") for k in range(10)}
     assert verdict_of(replace(estimate, refused=refused))[0] == "marginal"
     refused |= {f"y{k}": Refusal("calibrate.outlier") for k in range(20)}
@@ -180,7 +180,7 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(1.01, "pass"), (1.04, "marginal"), (0.9, "fail")])
-def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected, verdict_of):
+def test_plate_size_unlike_profile_is_named(estimate, factor, expected, verdict_of):
     def resized(seen):
         quality = replace(seen.lidar.quality, width_m=factor * BOARD.width_m, width_sigma_m=0.01)
         return replace(seen, surface=replace(seen.lidar, quality=quality))
@@ -252,7 +252,7 @@ def test_arrange_symptoms_follow_the_cause():
     note = LAST_REJECTED(capture="000014")
     listed = arrange([note, plane, squares_off("warning")])
     assert [(f.code, f.severity, f.follows) for f in listed] == [
-        # As severe as what it brings about.
+        # The cause has the severity of its consequences.
         ("verdict.scale", "error", ""),
         ("verdict.plane_residual", "error", "verdict.scale"),
         ("verdict.last_rejected", "note", ""),
@@ -311,7 +311,7 @@ def test_arrange_rough_lens_is_named_before_its_equals():
 
 
 @pytest.mark.parametrize("place", ["", "last"])
-def test_of_any_two_or_three_reasons_one_is_the_cause(place):
+def test_arrange_any_reasons_have_one_cause(place):
     verdicts = [code for code in KINDS if code.startswith("verdict.")]
     for codes in (*itertools.combinations(verdicts, 2), *itertools.combinations(verdicts, 3)):
         assert causes_of(arrange([Finding(code, figures={"place": place}) for code in codes])), codes

@@ -1,4 +1,4 @@
-"""Corners of boards as a known lens draws them, with a board that is not quite what its drawing says."""
+"""Corners of boards projected by a known lens, with a board slightly different from its specification."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ FISHEYE = Intrinsics(250.0, 251.0, 322.0, 236.0, 640, 480, "equidistant", (-0.05
 
 @dataclass(frozen=True)
 class Scene:
-    """How boards are held, and how corners err."""
+    """Poses of the boards and errors of their corners."""
 
     lens: Intrinsics = WIDE
     sigma_px: float = 0.05
@@ -45,7 +45,7 @@ def photograph(n, seed, scene=None, board=BOARD):
         turn = exp_so3(tilt * np.array([np.cos(angle), np.sin(angle), 0.0]))
         R = turn @ np.diag([1.0, -1.0, -1.0]) @ exp_so3(np.array([0, 0, roll]))
         T = pose(R, ray * rng.uniform(*scene.distance_m))
-        # A limp plate: bowed otherwise each time it is held.
+        # A limp plate: bowed differently at each placement.
         flutter = scene.flutter_m * rng.standard_normal(2)
         middle = flutter[0] * (1 - (x / x.max()) ** 2) + flutter[1] * (1 - (y / y.max()) ** 2)
         pixels, is_valid = scene.lens.project(transform(T, printed + middle[:, None] * [0, 0, 1]))

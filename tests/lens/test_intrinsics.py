@@ -1,4 +1,4 @@
-"""Intrinsics from boards: the truth within its stated deviations, whatever the start and the bad pictures."""
+"""Intrinsics from boards: the truth within the standard deviations, for any start and with bad images."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_lens_and_board_are_found_within_their_deviations(estimate):
 
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3], ids=["whole", "hidden"])
-def test_stated_deviations_are_true(hidden):
+def test_lens_standard_deviations_match_errors(hidden):
     scene = Scene(bow_m=(0.001, 0.0), aspect=-0.001, print_sigma_m=1e-4)
     rng, found = np.random.default_rng(0), []
     for seed in range(10):
@@ -133,7 +133,7 @@ def test_a_rough_guess_leads_to_the_same_lens(views, estimate, start):
     assert other.refused == {}
 
 
-def test_bad_pictures_are_named_and_do_no_harm(views):
+def test_bad_images_are_named_and_excluded(views):
     rng = np.random.default_rng(2)
     spoilt = list(views)
     shaken = views[2].board.corners_px + 2 * rng.standard_normal((24, 2))
@@ -163,28 +163,28 @@ def test_a_noisier_channel_counts_less_and_is_not_refused(views):
     assert np.abs(deviations(both, WIDE)).max() < 4
 
 
-def test_views_of_one_capture_are_left_out_together(views):
+def test_views_of_one_capture_are_held_out_together(views):
     twins = [replace(view, channel=channel) for view in views for channel in ("a", "b")]
     doubled = estimate_intrinsics(twins, BOARD, WIDE, RADTAN5, n_folds=4)
     single = estimate_intrinsics(views, BOARD, WIDE, RADTAN5, n_folds=4)
     assert doubled.held_out_rms_px == pytest.approx(single.held_out_rms_px, rel=0.05)
-    # The same corners twice are no more evidence than once.
+    # Duplicate corners add no information.
     assert np.all(doubled.sigma > 0.8 * single.sigma)
 
 
-def test_too_few_captures_are_refused_with_their_number(views):
+def test_too_few_captures_error_states_number(views):
     with pytest.raises(NotEnoughDataError):
         estimate_intrinsics(views[:3], BOARD, WIDE, RADTAN5)
 
 
 def test_parallel_boards_leave_the_focal_length_open():
-    # All in the middle and parallel to the picture: depth and focal length are one.
+    # All boards central and parallel to the image: depth and focal length are not separable.
     scene = Scene(tilt_deg=(0.0, 0.5), spread=(0.49, 0.51), sigma_px=0.3)
     with pytest.raises(NotEnoughDataError):
         estimate_intrinsics(photograph(8, 0, scene), BOARD, WIDE, RADTAN5)
 
 
-def test_captures_left_out_show_which_model_is_right():
+def test_held_out_captures_select_lens_model():
     seen = photograph(9, 4, replace(NEAR, lens=FISHEYE, sigma_px=0.02))
     start = Intrinsics(400.0, 400.0, 319.5, 239.5, 640, 480, "radtan", ())
     fits = [
@@ -222,7 +222,7 @@ def test_certainty_ends_where_boards_end():
     assert reach(middle) < 0.6
 
 
-def test_boards_that_face_the_camera_are_told_to_tilt():
+def test_frontal_boards_advise_tilt():
     scene = Scene(tilt_deg=(0.0, 4.0), spread=(0.35, 0.65), distance_m=(1.5, 2.5))
     facing = estimate_intrinsics(photograph(14, 6, scene), BOARD, WIDE, MODELS["radtan4"], n_folds=2)
     certainty = certainty_of(facing.intrinsics, facing.corners_px, facing.cov, facing.model)

@@ -1,4 +1,4 @@
-"""The calibration of a session takes from the rig what the algorithm cannot know."""
+"""The calibration of a session uses the rig's settings."""
 
 from typing import get_args
 
@@ -15,7 +15,7 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
 
 def systematic_sigma_m(*lines):
-    """Calibrate simulated boards for an RLFS whose LiDAR has these lines in its profile."""
+    """Calibrate simulated boards for an RLFS with these lines in its LiDAR's profile."""
     rig = parse_rig(RLFS.replace("    rate_hz: 10\n", "".join(f"    {line}\n" for line in lines), 1))
     (calibration,), _ = calibrate_detections(rig, found(), CalibrateOptions("paper"))
     return calibration.diagnostics.sigma_systematic_translation_m
@@ -37,7 +37,7 @@ def test_the_lidars_range_errors_come_from_the_profile():
 
 
 @pytest.mark.parametrize("method", get_args(Method))
-def test_a_profile_that_says_that_all_is_exact_is_believed(method):
+def test_exact_profile_adds_no_covariance(method):
     text = RLFS
     for key in ("square_sigma_m", "pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m"):
         text = set_value(text, f"board.{key}", "0.0")
@@ -45,6 +45,6 @@ def test_a_profile_that_says_that_all_is_exact_is_believed(method):
         text = set_value(text, f"cameras.cam.intrinsics.{key}", "0.0")
     options = CalibrateOptions(method)
     (calibration,), _ = calibrate_detections(parse_rig(text), found(), options)
-    # What checks contradict may widen the claim; lens and board add nothing to it.
+    # Contradictions may widen the covariance; lens and board add nothing.
     assert abs(calibration.cov_shared).max() < 1e-11  # of deviations of a micrometre
     assert 0 < calibration.sigma_translation_m < 0.02

@@ -1,4 +1,4 @@
-"""Two cameras that saw the same boards, alone or beside a LiDAR that only one of them shares boards with."""
+"""Two cameras that saw the same boards, alone, or with a LiDAR that shares boards with one of them."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def alone():
     return calibrate_detections(*stereo(0))
 
 
-def test_two_cameras_alone_are_within_their_claim(alone):
+def test_two_cameras_errors_fit_covariance(alone):
     (c,), shortages = alone
     assert not shortages and (c.camera, c.lidar, c.lidar_channel) == ("left", "right", "frames")
     assert c.verdict == "pass" and len(c.captures_used) == N
@@ -101,7 +101,7 @@ def test_lidar_in_no_capture_is_named():
 
 
 @pytest.mark.slow
-def test_two_cameras_claims_cover_errors_of_many_sessions():
+def test_two_cameras_covariances_fit_many_sessions():
     """60 sessions of 20 placements, with profiles that err as they state."""
     results = [c for seed in range(60) for c in calibrate_detections(*stereo(seed))[0]]
     rms_deg, rms_mm, covered = measure_errors(results)

@@ -22,7 +22,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.6), 0])
 
 
 def detections(session, **kept):
-    """What detectors would have seen; `kept` names captures by camera in which it saw the board."""
+    """Build simulated detections; `kept` lists, by camera, the captures with a detected board."""
     unseen = Refusal("image.too_dark", figures={"grey_99": 20.0})
     images = {
         (name, "frames"): {
@@ -55,7 +55,7 @@ def by_paper(session):
     return calibrated(detections(session), PAPER)
 
 
-def test_shared_boards_join_the_estimates(together):
+def test_cameras_with_shared_boards_are_estimated_jointly(together):
     for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
         own = together[name]
         assert own.verdict == "pass"
@@ -109,7 +109,7 @@ def test_cameras_without_a_common_board_share_the_lidar(session):
         assert own.other_cameras == ()
 
 
-def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
+def test_failed_cameras_each_have_a_reason(session):
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
     assert "left.frames" in caught.value.what and "3 of 12" in caught.value.what
@@ -126,13 +126,13 @@ def test_nudged_camera_is_named_and_the_other_kept(options):
     (moved,) = [f for f in found[RIGHT].findings if f.code == "verdict.moved"]
     assert not moved.subject and moved.figures["sensor"] == RIGHT
     assert moved.figures["captures"] == tuple(f"{k:06d}" for k in range(6, 12))
-    # The left camera, which nobody touched, is what it is without the other.
+    # The left camera, which did not move, has the same result without the other.
     error = difference(in_use(found[LEFT].T_cam_lidar, found[LEFT].intrinsics), TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
 
 
 def test_boards_that_moved_keep_cameras_apart(session):
-    """Pictures about each scan tell of boards on their way: each camera has board poses of its own."""
+    """Images around each scan show moving boards: each camera has separate board poses."""
     stamp_ns, track_s = 10**18, np.array([-0.1, -0.05, 0.05, 0.1])
 
     def moved(captures):

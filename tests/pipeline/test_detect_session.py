@@ -1,4 +1,4 @@
-"""Refusals of scans name the recording's fault where it hides the board."""
+"""Refusals of scans name a fault of the recording that prevents the detection."""
 
 import numpy as np
 

@@ -21,7 +21,7 @@ def doctor(rig, folder, duration_s=2.0):
 
 
 def doctor_until_scanned(rig, folder, duration_s=2.0):
-    """Examine a rig whose LiDAR is there; longer where a computer that is busy with others sends too late."""
+    """Examine a rig with an attached LiDAR; longer if a busy computer sends late."""
     for watch_s in (duration_s, 3 * duration_s, 9 * duration_s):
         start_s = time.monotonic()
         lines = doctor(rig, folder, watch_s)
@@ -49,7 +49,7 @@ def test_every_device_of_an_attached_rig_answers_by_name(everything):
 
 def test_its_streams_come_and_none_of_them_is_lost(everything):
     lines, *_ = everything
-    # A busy computer sends late and in bursts: how rates are judged is tested by itself.
+    # A busy computer sends late and in bursts; the judgement of rates is tested separately.
     lidar, cam = lines["lidar", "stream"].findings, lines["cam", "stream"].findings
     assert lidar[0].figure("rate_hz") > 0 and cam[0].figure("rate_hz") > 0
     assert lidar[1].figure("n_packets") > 200

@@ -1,4 +1,4 @@
-"""Raw events of a capture are seen through pictures for the LiDAR's time on the board, made once."""
+"""Images are reconstructed once from raw events, at the time of the board in the scan."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def test_event_board_is_found_at_mid_scan(seen):
     assert board.events.events_px_s > 5
 
 
-def test_what_was_found_and_its_picture_are_remembered(seen):
+def test_event_detection_and_image_are_cached(seen):
     files = sorted((seen.path / "detections").rglob("*.npz"))
     kinds = sorted(file.name.split(".", 1)[1] for file in files)
     assert kinds == ["dvs.events.npz", "dvs.events.picture.npz", "lidar.npz"]

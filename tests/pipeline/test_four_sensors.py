@@ -29,7 +29,7 @@ def sound():
     return calibrate(simulate(N, 0))
 
 
-def test_four_sensors_poses_are_within_their_claims(sound):
+def test_four_sensors_errors_fit_covariance(sound):
     assert len(sound) == 5
     for result in sound.values():
         assert result.verdict == "pass", result.findings
@@ -67,8 +67,8 @@ def test_exchanged_lidars_are_named_in_all_pairs():
         assert len(texts) == 1 and "front and rear are exchanged" in texts[0]
 
 
-def test_moved_sensor_is_named_where_a_pair_saw_little_of_it():
-    """The cameras have one and two captures from before the motion, and one result does not use its own."""
+def test_moved_sensor_is_named_from_few_captures():
+    """The cameras have one and two captures before the motion, and one result does not use its own."""
     after = perturb(ON_FRONT["rear"], np.r_[0.012, -0.004, 0.016, np.radians([0.5, 0.6, -0.6])])
     results = calibrate(simulate(N, 6, moves={"rear": lambda k: ON_FRONT["rear"] if k < 8 else after}))
     verdicts = {"rear": [], "others": []}
@@ -93,7 +93,7 @@ def test_sensor_on_another_clock_is_named_once():
 
 
 @pytest.mark.slow
-def test_four_sensors_claims_cover_errors_of_many_sessions():
+def test_four_sensors_covariances_fit_many_sessions():
     """50 sessions of 30 placements, each seen by two or three of four sensors; profiles err as they state."""
     results = [
         c for seed in range(50) for c in calibrate_detections(make_rig(seed=seed), simulate(N, seed))[0]

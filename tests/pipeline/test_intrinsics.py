@@ -1,4 +1,4 @@
-"""Intrinsics of a session whose profile may be wrong: found, held against the profile, and written."""
+"""Intrinsics of a session with a possibly wrong profile: estimated, compared and written."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ LENS = RIG.cameras["davis"].to_intrinsics()
 
 @pytest.fixture(scope="module")
 def pictures():
-    """The board eight times all over the picture, as the profile's lens draws it."""
+    """Eight boards over the whole image, projected with the profile's lens."""
     board, rng = RIG.board.to_board(), np.random.default_rng(1)
     drawn = []
     while len(drawn) < 8:
@@ -40,7 +40,7 @@ def pictures():
 
 
 def session_of(path, pictures, channel="frames", **camera):
-    """Make a session of pictures with keys of the camera set to other values."""
+    """Create a session of images with changed keys of the camera."""
     text = RLES
     for key, value in camera.items():
         text = set_value(text, f"cameras.davis.{key.replace('__', '.')}", value)
@@ -82,7 +82,7 @@ def test_wrong_intrinsics_lead_to_the_same_lens_and_fail(pictures, tmp_path):
     assert measured.check.verdict() == "fail"
 
 
-def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
+def test_profile_of_other_resolution_is_accepted(pictures, tmp_path):
     text = set_value(RLES, "cameras.davis.resolution_px", "[692, 520]")
     double = {"fx_px": "699.1", "fy_px": "698.4", "cx_px": "345.5", "cy_px": "253.0"}
     for key, value in double.items():
@@ -100,7 +100,7 @@ def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
     assert camera.to_intrinsics() == measured.intrinsics
 
 
-def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
+def test_channels_share_lens_and_bad_images_are_named(pictures, tmp_path):
     session = session_of(tmp_path / "session", pictures[:4])
     with Session.open(session.path, writable=True) as writer:
         for pixels in [*pictures[4:], np.full((260, 346), 90, dtype=np.uint8)]:

@@ -1,4 +1,4 @@
-"""Which sessions tell a LiDAR's constant errors."""
+"""Sessions that determine a LiDAR's constant errors."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Two LiDARs that saw the same plate: their pose to each other, and what must never pass."""
+"""Two LiDARs that saw the same plate: their relative pose, and cases that must not pass."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def make_rig(board=PLATE, model="VLP-16", nominal=True):
 
 
 def scan_both(n, seed, board, *, n_moved=0, move=None):
-    """Scan boards by both LiDARs; before the last `n_moved`, the right one moves."""
+    """Scan boards with both LiDARs; the right one moves before the last `n_moved`."""
     rng, scenario = np.random.default_rng(seed), Scenario(range_sigma_m=0.01)
     left = {}
     right = {}

@@ -1,4 +1,4 @@
-"""Scans are searched again where the other captures say that the board is."""
+"""Scans are searched again at the position predicted from the other captures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A profile of one's own rig, from numbers or from a bag, holds what was given and nothing of another rig."""
+"""A new rig's profile, from numbers or a bag, holds only the given values."""
 
 import numpy as np
 import pytest

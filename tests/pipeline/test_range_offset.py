@@ -1,4 +1,4 @@
-"""A LiDAR whose ranges are all too long is calibrated as any other by a profile that states by how much."""
+"""A LiDAR with constantly long ranges is calibrated with a profile that states the offset."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ LONG = changed(SOUND, lidars__lidar__range_offset_m=OFFSET_M)
 
 
 def simulated(n_captures):
-    """Simulate captures of a LiDAR whose driver's ranges are that much too long."""
+    """Simulate captures of a LiDAR with an offset of its driver's ranges."""
     return compute_once(
         f"long ranges {n_captures}",
         lambda: list(simulate_captures(LONG, n_captures=n_captures, seed=SEED)),
@@ -97,7 +97,7 @@ def test_calibrate_with_range_offset_recovers_truth(tmp_path):
     error = difference(truth, result.T_cam_lidar)
     assert np.sqrt(error @ np.linalg.solve(result.cov, error) / 6) < 2.5
     assert np.linalg.norm(error[:3]) < 0.012
-    # Without it, the planes lie apart and the squares are blamed.
+    # Without it, the planes disagree and the squares are reported as the cause.
     assert without.verdict == "fail" and result.verdict == "pass"
 
 

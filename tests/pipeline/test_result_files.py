@@ -176,7 +176,7 @@ def test_the_report_stays_with_its_result(session, folder):
 
 
 def test_an_interrupted_report_leaves_a_complete_result(session, folder):
-    """The result stands before its report is drawn; a report never comes beside another result."""
+    """The result exists before its report is drawn; a report never stands beside another result."""
     write(session, GOOD, report=True)
     result = Result(session, (OTHER,))
     files = {path.name for path in result.write(report=False).files}

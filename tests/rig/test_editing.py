@@ -15,7 +15,7 @@ def test_derive_new_focus_keeps_comments():
     numbers = {"fx_px": "305.5716", "fy_px": "305.6182", "cx_px": "175.2111", "cy_px": "125.4881"}
     settings = [(f"cameras.davis.intrinsics.{key}", value) for key, value in numbers.items()]
     text = derive_text(RLES, "rles02", settings, "rles02.yaml", "rles")
-    # What stands above the first key, and the description, are of the other rig.
+    # The comments above the first key, and the description, are of the other rig.
     own = RLES[RLES.index("format_version") :]
     changed = [(a, b) for a, b in zip(own.splitlines(), text.splitlines()[1:], strict=True) if a != b]
     assert len(changed) == 6 and "description: ''" in text
@@ -58,7 +58,7 @@ def test_derive_wrong_profile_names_the_key():
         ("quality.x.y", "1 # b"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_usage_errors(path, value):
+def test_implausible_settings_are_usage_errors(path, value):
     with pytest.raises(UsageError):
         set_value(RLES, path, value)
 

@@ -87,7 +87,7 @@ def test_a_missing_file_or_a_folder_is_no_profile(name):
         (b"name: !!bool x\n", ""),
     ],
 )
-def test_what_is_no_profile_is_refused_with_its_place(tmp_path, content, place):
+def test_invalid_profile_error_has_line(tmp_path, content, place):
     path = tmp_path / "mine.yaml"
     path.write_bytes(content)
     with pytest.raises(ProfileError) as caught:

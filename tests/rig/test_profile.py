@@ -1,4 +1,4 @@
-"""The schema: what a profile may say, and what it cannot mean."""
+"""The schema: valid profiles, and mistakes that it rejects."""
 
 import re
 from pathlib import Path
@@ -27,7 +27,7 @@ RLES = find_profile("rles").read_text(encoding="utf-8")
 
 
 def refusal(*edits):
-    """Edit rlfs.yaml and return what is said about it."""
+    """Edit rlfs.yaml and return the error or warnings."""
     text = RLFS
     for old, new in edits:
         assert old in text
@@ -159,7 +159,7 @@ def test_nominal_rotation_notations_agree(phi):
         "tolerance_deg: 5.0",
     ],
 )
-def test_what_is_no_rotation_is_refused(rotation):
+def test_invalid_rotation_is_refused(rotation):
     text = RLFS.replace("    tolerance_deg: 5.0\n", "")
     text = text.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", rotation)
     with pytest.raises(ProfileError):
@@ -179,7 +179,7 @@ def test_documented_defaults_are_those_of_the_code():
     for line in DOCUMENT.read_text(encoding="utf-8").splitlines():
         keys, _, rest = line.removeprefix("| ").partition(" | ")
         values = rest.partition(" | ")[0].split(", ")
-        # A key of the same name in a later block has a default of its own.
+        # A key of the same name in a later block has another default.
         documented = dict(zip(re.findall(r"`(\w+)`", keys), values, strict=False)) | documented
     for model in (QualitySettings, CalibrationSettings, LidarSettings):
         for key, field in model.model_fields.items():

@@ -19,7 +19,7 @@ SEED = 2
 
 
 class Seen(NamedTuple):
-    """What the sensors saw, and the truth."""
+    """The sensors' data, and the truth."""
 
     rig: Rig
     captures: list[SimulatedCapture]

@@ -34,7 +34,7 @@ class MovingRig:
         return cls(stage, np.array(velocity_mps, dtype=np.float64), turn_rad_s, start)
 
     def base_at(self, t_ns):
-        """Where the rig is, relative to where it stands in the stage, (..., 4, 4)."""
+        """Pose of the rig relative to its pose in the stage, (..., 4, 4)."""
         t_s = 1e-9 * (np.asarray(t_ns, dtype=np.float64) - START_NS)[..., None]
         turn = exp_so3(t_s * [0.0, 0.0, self.turn_rad_s])
         return self.T_world_start @ pose(turn, t_s * self.velocity_mps)

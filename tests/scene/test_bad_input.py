@@ -27,7 +27,7 @@ def _of_image(change):
 
 
 def _featureless(image, scan, rng):
-    """Stand in an empty round room: walls of 6 m radius, a floor without a print."""
+    """Put the rig into an empty round room: walls of 6 m radius, a floor without texture."""
     rays = scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
     range_m = np.minimum(6.0 / np.hypot(rays[:, 0], rays[:, 1]), 1.0 / np.maximum(-rays[:, 2], 1e-3))
     points = (rays * range_m[:, None]).astype(np.float32)
@@ -37,7 +37,7 @@ def _featureless(image, scan, rng):
 
 
 def _rain(image, scan, rng):
-    """Let drops return a fifth of the beams from anywhere before what they should meet."""
+    """Let drops return a fifth of the beams from random points in front of the true ones."""
     is_drop = rng.random(len(scan.points)) < 0.2
     share = np.where(is_drop, rng.uniform(0.1, 1.0, len(scan.points)), 1.0)
     points = (scan.points * share[:, None]).astype(np.float32)
@@ -75,7 +75,7 @@ def judge_corrupted(rig, captures, deployed, corrupt):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CORRUPTIONS)
-def test_a_corruption_is_never_an_all_clear(seen, name):
+def test_corrupted_input_never_passes_drift(seen, name):
     pair = judge_corrupted(seen.rig, seen.captures, seen.truth, CORRUPTIONS[name])
     assert pair.state != "unchanged"
     assert pair.findings[0].code.startswith("scene.") and pair.findings[0].severity != "note"

@@ -33,7 +33,7 @@ from tests.saved_results import write_result
 
 @pytest.fixture
 def turned(seen, tmp_path):
-    """A result whose extrinsics are turned by 2 deg about the camera's y axis."""
+    """A result with extrinsics rotated by 2 deg about the camera's y axis."""
     T = perturb(seen.truth.T_cam_lidar, np.array([0, 0, 0, 0, np.radians(2.0), 0]))
     write_result(tmp_path / "result.json", seen.rig.name, [replace(seen.truth, T_cam_lidar=T)])
     return tmp_path / "result.json"
@@ -123,7 +123,7 @@ def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, c
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, "result.json", "rig.yaml"])
 
 
-def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys):
+def test_drift_exit_code_follows_worst_camera(seen, two_cameras, tmp_path, capsys):
     bag = record(tmp_path / "two.bag", two_cameras, seen.captures, ("cam", "cam2"))
     (tmp_path / "rig.yaml").write_text(dump_rig(two_cameras))
     turned = perturb(seen.truth.T_cam_lidar, np.array([0, 0, 0, 0, np.radians(2.0), 0]))
@@ -135,7 +135,7 @@ def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys
     assert states == {"cam": "unchanged", "cam2": "changed"}
 
 
-def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp_path):
+def test_drift_unrecorded_camera_affects_only_itself(seen, two_cameras, tmp_path):
     bag = record(tmp_path / "one.bag", seen.rig, seen.captures)
     result = ResultFile(rig=seen.rig.name, pairs=(seen.truth, replace(seen.truth, camera="cam2")))
     first, second = drift(bag, result, rig=two_cameras).pairs
@@ -172,7 +172,7 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys):
         words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
         code = run([*words, "--seconds", "10"])
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
-    # One view of the room again and again says no more than once.
+    # Repeated views of the room add no information.
     assert code in (0, 6) and pair["state"] != "changed"
     assert pair["scene"]["n_captures"] > 5
 
@@ -222,7 +222,7 @@ def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp
         assert (pair.state, pair.drift.n_captures) == (state, len(scans))
 
 
-def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen):
+def test_drift_events_of_standing_rig_cannot_tell(seen):
     result = ResultFile(rig=seen.rig.name, pairs=(seen.truth,))
     captures = SceneCaptures(seen.rig, result, "a standing rig")
     rng = np.random.default_rng(0)
@@ -240,14 +240,14 @@ def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen):
     assert told == ["cam"]
 
 
-def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path):
+def test_drift_contradictory_arguments_are_refused(room, seen, tmp_path):
     (tmp_path / "rig.yaml").write_text(dump_rig(seen.rig))
     assert run(["drift", str(room), "--seconds", "3"]) == 2
     assert run(["drift", "--rig", str(tmp_path / "rig.yaml")]) == 2
     assert run(["drift", str(tmp_path / "nothing"), "--rig", "rlfs"]) == 4
 
 
-def test_a_board_in_view_has_an_opinion_of_its_own(room, turned):
+def test_drift_board_in_view_is_evaluated(room, turned):
     for result, state in ((None, "unchanged"), (read_result(turned), "changed")):
         (pair,) = drift(room, result).pairs
         assert pair.state == state

@@ -150,7 +150,7 @@ def test_better_focal_finds_wrong_lens(views, scale, sign):
 
 
 @pytest.mark.parametrize("change", [(0, 0, 6, 0), (0, 0, 0, -6), (4, 4, 0, 0)])
-def test_follow_lens_foretells_another_estimate(views, change):
+def test_follow_lens_predicts_other_estimate(views, change):
     change = np.array([*change, 0, 0, 0, 0], dtype=np.float64)
     found, lens = estimate(views), MODELS["radtan4"].intrinsics(VECTOR + change, 640, 360)
     other = estimate_scene(views, lens, TRUTH)

@@ -48,7 +48,7 @@ def watch_captures(driven, late_ns=0, change=lambda scan: scan, T_cam_lidar=None
     return pair.drift
 
 
-def test_two_scans_tell_the_motion(driven):
+def test_two_scans_determine_the_motion(driven):
     for rig, before, scan, _ in driven:
         motion = estimate_motion(before, scan)
         T_world_lidar = rig.sensor_at("lidar", before.stamp_ns)
@@ -57,7 +57,7 @@ def test_two_scans_tell_the_motion(driven):
         assert motion.rate_rad_s == pytest.approx([0, 0, rig.turn_rad_s], abs=0.012)
 
 
-def test_scans_of_a_standing_rig_tell_no_motion(seen):
+def test_standing_rig_scans_give_no_motion(seen):
     standing = MovingRig.build(small_rig(), 2, (0, 0, 0), 0.0)
     before, scan = (standing.scan("lidar", START_NS + k * PERIOD_NS, k) for k in range(2))
     assert estimate_motion(before, scan).is_still
@@ -92,7 +92,7 @@ def straight():
     return captures
 
 
-def test_clocks_are_named_beside_a_change_that_they_explain(straight):
+def test_drift_names_clocks_that_explain_a_change(straight):
     drift = watch_captures(straight, 100_000_000)
     assert drift.state == "changed"
     summary, clocks, *_ = drift.findings

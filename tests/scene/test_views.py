@@ -1,4 +1,4 @@
-"""Edges of what moves before a standing rig are left out."""
+"""Edges of moving objects in front of a standing rig are removed."""
 
 from dataclasses import replace
 

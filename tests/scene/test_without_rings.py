@@ -51,7 +51,7 @@ def test_scene_without_rings_changes_do_not_hold(seen, axis, sign):
 
 
 @pytest.mark.long
-def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, capsys):
+def test_drift_and_calibrate_use_scene_and_boards(seen, tmp_path, capsys):
     with Session.create(tmp_path / "room", seen.rig) as session:
         for capture in seen.captures:
             session.add_capture(capture.images, capture.scans, {})

@@ -59,13 +59,13 @@ def contradiction(axis, sigmas, sigma=0.01):
 @pytest.mark.parametrize(("axis", "action"), [("rotation_x", ""), ("translation_z", "distances")])
 def test_scene_contradiction_size_decides_axis_names_cause(seen, sigmas, verdict, axis, action):
     judged = with_opinion(seen.truth, contradiction(axis, sigmas))
-    # The first one is the scene's; that of a marginal result says how wrong it may be.
+    # The first finding is the scene's; that of a marginal result states the error bound.
     finding = judged.findings[0]
     assert judged.verdict == verdict and finding.action == action
     assert finding.figures["axes"] == (axis,)
 
 
-def test_of_moving_boards_the_times_may_be_wrong(seen):
+def test_scene_witness_ignores_times_of_moving_boards(seen):
     channel = ChannelResult("frames", 9, 0.1, 0.03, 0.004)
     moving = replace(seen.truth, channel_results=(channel,))
     judged = with_opinion(moving, contradiction("rotation_y", 6))
@@ -118,7 +118,7 @@ def test_without_frames_it_cannot_tell(seen, tmp_path):
     assert (opinion.n_captures, opinion.n_edges, opinion.state) == (0, 0, "unknown")
 
 
-def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path):
+def test_scene_witness_skips_damaged_capture(room, seen, tmp_path):
     copy = tmp_path / "damaged"
     shutil.copytree(room, copy)
     session = Session.open(copy)
@@ -128,7 +128,7 @@ def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path):
     assert opinion.n_captures == 3 and opinion.state != "contradicts"
 
 
-def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path):
+def test_verify_checks_the_sessions_scene(heard, seen, tmp_path):
     session, detections = heard
     write_result(tmp_path / "result.json", seen.rig.name, [turned(seen.truth, 1.5)])
     (check,) = verify(session, read_result(tmp_path / "result.json"), detections).checks
@@ -138,7 +138,7 @@ def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path):
     assert check.document()["scene"]["state"] == "contradicts"
 
 
-def test_the_verbs_tell_the_opinion(heard, room, seen, tmp_path, capsys):
+def test_commands_report_scene_check(heard, room, seen, tmp_path, capsys):
     copy = tmp_path / "session"
     shutil.copytree(room, copy)
     result = turned(seen.truth, 1.5)

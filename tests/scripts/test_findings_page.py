@@ -9,6 +9,6 @@ PRINT = "import runpy, sys; sys.stdout.buffer.write(runpy.run_path(sys.argv[1])[
 
 def test_the_page_lists_the_codes_as_they_are_declared():
     """Run scripts/findings_page.py after a change of a kind."""
-    # A process of its own declares no kinds of tests.
+    # A separate process does not declare the tests' kinds.
     fresh = subprocess.run([sys.executable, "-c", PRINT, str(SCRIPT)], check=True, capture_output=True)
     assert PAGE.read_bytes() == fresh.stdout

@@ -8,7 +8,7 @@ from lce_rig.core.data import Image, Scan
 
 @pytest.fixture
 def samples():
-    """A picture and a scan of noise for each seed."""
+    """An image and a scan of noise for each seed."""
 
     def build(seed, n_points=300):
         rng = np.random.default_rng(seed)

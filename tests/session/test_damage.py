@@ -1,4 +1,4 @@
-"""Whatever happens to the disk or the process, captures made before are whole, and damage is named."""
+"""Earlier captures survive any failure of disk or process, and damage is reported."""
 
 import signal
 import subprocess
@@ -36,7 +36,7 @@ def test_killed_writer_leaves_whole_captures(tmp_path):
     path = tmp_path / "s"
     promised = set()
     for k in range(6):
-        # The writer's standard output tells which captures it was promised before it died.
+        # The writer's standard output lists the captures reported as saved before it was killed.
         process = subprocess.Popen(
             [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True
         )
@@ -93,7 +93,7 @@ def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path, rig, samples
     session.captures[1].check()
 
 
-def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path, rig, samples):
+def test_missing_sample_error_lists_present_ones(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})
     with pytest.raises(SessionError, match=r"cam\.frames"):

@@ -55,7 +55,7 @@ def test_events_come_back_to_the_microsecond(tmp_path, rles):
     with_events.check()
 
 
-def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rles):
+def test_event_file_is_hashed_in_manifest(tmp_path, rles):
     capture = make_session(tmp_path / "s", rles).captures[0]
     events, data = noise_events(0), (capture.path / FILE).read_bytes()
     with np.load(capture.path / FILE) as archive:

@@ -1,4 +1,4 @@
-"""A manifest from somebody else: what is wrong with it is a refusal of its capture, and of no other."""
+"""A foreign manifest: a fault refuses its capture, and no other."""
 
 import json
 

@@ -18,7 +18,7 @@ Samples = Callable[..., tuple[list[Any], list[Any]]]
 
 @pytest.fixture
 def fill(rig, samples):
-    """Make a session of two captures whose sensors told these serial numbers."""
+    """Create a session of two captures with these reported serial numbers."""
 
     def make(folder, rig=rig, *told, seeds=(1, 2)):
         with Session.create(folder, rig) as session:
@@ -74,7 +74,7 @@ def test_the_fingerprint_changes_with_inputs_only(fill, rig, samples, tmp_path):
 def test_provenance_without_times_has_import(rig, samples, tmp_path):
     with Session.create(tmp_path / "a", rig) as session:
         images, scans = samples(1)
-        # A clock that counts from the sensor's start tells no date.
+        # A clock that counts from the sensor's start has no date.
         session.add_capture(
             [replace(image, stamp_ns=5 * 10**9) for image in images],
             [replace(scan, stamp_ns=5 * 10**9, host_ns=None) for scan in scans],

@@ -68,7 +68,7 @@ def test_a_capture_that_is_not_there_is_named(session, verb):
         getattr(session, verb)("000009")
 
 
-def test_a_session_open_for_reading_rejects_nothing(session):
+def test_reject_in_read_only_session_is_refused(session):
     with pytest.raises(SessionError):
         Session.open(session.path).reject("000000")
     assert len(session.captures) == 3

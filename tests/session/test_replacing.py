@@ -50,7 +50,7 @@ def test_an_error_leaves_the_earlier_folder(tmp_path):
 
 
 def test_replace_in_linked_session_only(tmp_path):
-    """A link in the place of what is replaced is refused."""
+    """A link in place of the folder to replace is refused."""
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     for text in ("one", "two"):
@@ -64,7 +64,7 @@ def test_replace_in_linked_session_only(tmp_path):
     assert contents(tmp_path / "real" / "may") == {"two"}
 
 
-def test_whoever_is_killed_leaves_one_whole_folder(tmp_path):
+def test_killed_replacement_leaves_one_complete_folder(tmp_path):
     fill(tmp_path, "first")
     for k in range(2):  # scripts/fuzz.py result-kills does it by the hundred
         process = subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stdout=subprocess.PIPE)

@@ -1,4 +1,4 @@
-"""A session keeps what it was given, exactly, and lets nobody else write to it."""
+"""A session stores data exactly, and has one writer at a time."""
 
 import json
 
@@ -76,7 +76,7 @@ def test_discard_only_an_empty_session(tmp_path, rig, samples):
     assert Session.open(tmp_path / "noted").captures == []
 
 
-def test_only_one_writer_is_let_in_and_readers_always(tmp_path, rig, samples):
+def test_session_allows_one_writer_and_many_readers(tmp_path, rig, samples):
     first = Session.create(tmp_path / "s", rig)
     with pytest.raises(SessionError):
         Session.resume(tmp_path / "s", rig)
@@ -86,7 +86,7 @@ def test_only_one_writer_is_let_in_and_readers_always(tmp_path, rig, samples):
     Session.resume(tmp_path / "s", rig).close()
 
 
-def test_folders_that_are_no_session_are_left_alone(tmp_path, rig):
+def test_folders_without_session_are_unchanged(tmp_path, rig):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(SessionError, match=r"notes\.txt"):
         Session.create(tmp_path, rig)
@@ -133,7 +133,7 @@ def test_sensors_that_the_rig_lacks_are_refused(tmp_path, rig, samples):
     assert session.captures == []
 
 
-def test_the_same_data_is_recognised_whatever_their_stamps(tmp_path, rig, samples):
+def test_duplicate_data_is_recognised_despite_timestamps(tmp_path, rig, samples):
     images, scans = samples(5)
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(4), {})
@@ -171,7 +171,7 @@ def test_load_arrays_damage_is_never_wrong(tmp_path):
     assert load_arrays(file.with_name("000001.npz")) is None
 
 
-def test_meta_that_is_no_json_is_refused_and_leaves_nothing(tmp_path, rig, samples):
+def test_invalid_metadata_is_refused_without_files(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     with pytest.raises(SessionError):
         session.add_capture(*samples(0), {"x": float("nan")})

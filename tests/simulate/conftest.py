@@ -96,6 +96,6 @@ def render_image(scene, backdrop, noise, rng):
 
 
 def simulate_scan(scene, T_world_lidar, model, noise, rng, *, stamp_ns=0, board_at=None, **measured):
-    """One revolution; what is measured is told as to `measure_sweep`."""
+    """Simulate one revolution; `measured` goes to `measure_sweep`."""
     sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
     return measure_sweep(sweep, model, noise, rng, stamp_ns=stamp_ns, **measured)

@@ -1,4 +1,4 @@
-"""Rendered pictures agree with the lens model to a small part of a pixel, and their noise with its claims."""
+"""Rendered images agree with the lens model at sub-pixel level, and their noise with its parameters."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ PLACEMENTS = [placed(1.5, 0.1, 0.0, 10, 45), placed(1.9, -0.4, 0.2, -30, 52), pl
 
 
 def refined(picture, truth):
-    """Find corners (N, 2) px in a picture from where the truth has them, and a little beside."""
+    """Find corners (N, 2) px in an image, starting near the true ones."""
     import cv2
 
     start = truth.astype(np.float32).reshape(-1, 1, 2) + np.float32(0.3)

@@ -94,7 +94,7 @@ MOUNTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("mount", sorted(MOUNTS))
-def test_cameras_mounted_anyhow_see_the_board(mount):
+def test_cameras_of_any_mounting_see_the_board(mount):
     rig = make_rig(nominal_extrinsics=(nominal("cam", **MOUNTS[mount]),))
     for capture in simulate_captures(rig, n_captures=1, seed=0):
         assert rig.cameras["cam"].to_intrinsics().is_inside(corners_px(rig, "cam", capture)).all()
@@ -118,7 +118,7 @@ def test_two_cameras_take_turns_as_target():
     assert set(truth_extrinsics(rig, 0)) == {("left", "lidar"), ("rear", "lidar")}
 
 
-def test_a_lidar_nobody_can_simulate_is_named(rig):
+def test_unsupported_lidar_is_named(rig):
     odd = make_rig(lidars={"lidar": {"model": "XY-64"}})
     with pytest.raises(ProfileError, match=r"lidars\.lidar\.model") as caught:
         next(simulate_captures(odd, n_captures=1, seed=0))

@@ -20,7 +20,7 @@ SECOND_NS = 1_000_000_000
 
 
 def ripples(seed=0):
-    """Intensities that rise and fall smoothly, each pixel in its own way, by a factor of up to twenty."""
+    """Smoothly varying intensities, different for each pixel, by a factor of up to twenty."""
     rng = np.random.default_rng(seed)
     swing, rate, phase = rng.uniform(0.1, 1.5, SHAPE), rng.uniform(3, 20, SHAPE), rng.uniform(0, 6.3, SHAPE)
     return lambda t_s: np.exp(swing * np.sin(rate * t_s + phase) - 1.6).astype(np.float32)

@@ -134,7 +134,7 @@ def test_returns_reach_over_by_the_footprint(board, T_world_lidar, noise, growth
     assert 1e3 * np.mean(growth) == pytest.approx(growth_mm, abs=1.0)
 
 
-def test_range_noise_has_the_sigma_it_claims(board, T_world_lidar):
+def test_range_noise_has_stated_sigma(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0, roll_deg=0.0))
     noise = replace(EXACT, range_sigma_m=0.02)
     error = in_board(scene, T_world_lidar, scan_of(scene, T_world_lidar, noise))[:, 2]

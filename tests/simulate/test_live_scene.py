@@ -1,4 +1,4 @@
-"""A board held or carried before the simulated sensors: what is spared changes nothing that is measured."""
+"""A board held or carried in front of the simulated sensors: optimisations do not change the data."""
 
 import numpy as np
 import pytest

@@ -65,7 +65,7 @@ def moving_scan(board, T_world_lidar, trajectory, noise):
 
 
 def heights_m(scan, T_world_lidar, T_world_board):
-    """Distance of each point from the plane of its own pose (N, 4, 4), or of one for all."""
+    """Distance of each point from the plane of its pose (N, 4, 4), or of one pose for all."""
     T_board_lidar = invert(T_world_board) @ T_world_lidar
     along = np.broadcast_to(T_board_lidar[..., 2, :3], scan.points.shape)
     return np.einsum("nj,nj->n", along, scan.points) + T_board_lidar[..., 2, 3]

@@ -1,4 +1,4 @@
-"""Captures of a moving board: pictures, scans and events tell of one board at their own times."""
+"""Captures of a moving board: images, scans and events show one board at their own times."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def stamp_of(image):
 
 
 def found_corners(rig, image, T_cam_board):
-    """Corners refined in a picture from where the truth has them, and the truth (N, 2)."""
+    """Corners refined in an image from the true ones, and the truth (N, 2)."""
     import cv2
 
     corners = transform(T_cam_board, rig.board.to_board().corners())
@@ -142,7 +142,7 @@ def test_stamps_include_their_channel_offset(rig, quiet):
     assert np.sqrt(np.mean((found - truth) ** 2)) < 0.08
     both = capture.events[0], quiet.events[0]
     assert [events.t_ns[0] for events in both] == pytest.approx([both[1].t_ns[0]] * 2, abs=2e7)
-    # The same flash of the scene is told 15 ms earlier: activity follows the speed, shifted.
+    # The same flash of the scene is timestamped 15 ms earlier: activity follows the speed, shifted.
     scan_ns = quiet.scans[0].stamp_ns or 0
     edges = scan_ns + 1_000_000 * np.arange(-150, 90, 10)
     shifted, plain = np.histogram(both[0].t_ns, edges - 15_000_000)[0], np.histogram(both[1].t_ns, edges)[0]

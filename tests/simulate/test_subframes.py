@@ -1,4 +1,4 @@
-"""What event pixels see agrees in geometry and brightness with the pictures of the renderer."""
+"""Images for event pixels agree in geometry and brightness with rendered images."""
 
 import numpy as np
 import pytest

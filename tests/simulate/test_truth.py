@@ -1,4 +1,4 @@
-"""The truth beside a simulation says when the LiDAR met the board, and where it was then."""
+"""The truth of a simulation states when the LiDAR scanned the board, and its pose at that time."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def rig():
 
 
 def scan_of(T_lidar_board, offset_ns, on_board):
-    """Points all over the plate, and as many a metre behind it, at their firing times (N,)."""
+    """Points all over the plate, and as many 1 m behind it, at their firing times (N,)."""
     rng = np.random.default_rng(0)
     points_board = rng.uniform([-0.35, -0.25, -0.01], [0.35, 0.25, 0.01], (len(offset_ns), 3))
     points_board[~on_board, 2] += 1.0

@@ -1,4 +1,4 @@
-"""LiDARs without rings: simulated as data sheets say, and calibrated to within what the result states."""
+"""LiDARs without rings: simulated from data sheets, and calibrated within the reported covariance."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Offset and drift of clocks: the truth lies within the stated sigmas, jumps are seen, hours completed."""
+"""Offset and drift of clocks: truth within the stated sigmas, jumps detected, hours completed."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ S = 1_000_000_000
 
 
 class Device:
-    """A device whose clock began at a moment of the host's, and goes faster than it by `drift`."""
+    """A device with a clock that starts at a given host time and runs faster than the host's by `drift`."""
 
     def __init__(self, drift, offset_ns=5 * S):
         self.drift, self.offset_ns = drift, offset_ns
@@ -78,7 +78,7 @@ def test_clock_edges_error_matches_sigma(where_s):
     assert 0.85 < rms(sigmas) < 1.2
 
 
-def test_a_drift_that_changes_after_the_data_is_allowed_for():
+def test_clock_model_allows_later_drift_change():
     device = Device(drift=40e-6)
     model = fit_clock(*edges(np.random.default_rng(0), device), "edges")
     later = model.last_ns + 600 * S
@@ -87,7 +87,7 @@ def test_a_drift_that_changes_after_the_data_is_allowed_for():
     assert model.sigma_ns(later) > 10 * model.sigma_ns(model.last_ns)
 
 
-def test_a_fifth_of_false_edges_does_not_move_the_line():
+def test_clock_fit_tolerates_20_percent_false_edges():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         device = Device(drift=40e-6)
@@ -162,7 +162,7 @@ def test_clock_device_restart_is_noticed():
     assert tracker.model.first_ns >= steps[0].source_ns
 
 
-def test_a_tracker_forgets_what_is_older_than_its_window():
+def test_clock_tracker_drops_old_readings():
     tracker = ClockTracker("edges")
     for k in range(2_000):
         tracker.add(k * S // 10, START_NS + k * S // 10)

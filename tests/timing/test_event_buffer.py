@@ -1,4 +1,4 @@
-"""Frames get exactly the events around their scan, in whatever packets these come, with bounded memory."""
+"""Frames get exactly the events around their scan, for any packet sizes, with bounded memory."""
 
 import tracemalloc
 from dataclasses import replace
@@ -85,7 +85,7 @@ def test_event_buffer_reports_missing_time(rles):
     assert frames[2].events[0].missing_ns == first_ns - (T0_NS + 1700 * MS - BEFORE_NS)
 
 
-def test_a_frame_waits_for_its_events_but_not_for_ever(rles):
+def test_frame_wait_for_events_is_limited(rles):
     events = stream(0, 1500, 3000)
     first, *others = packets(events, range(50, 3000, 50))
     early = [first, scan(1000), image(1050), image(1200), *others]
@@ -100,7 +100,7 @@ def test_a_frame_waits_for_its_events_but_not_for_ever(rles):
     assert earliest.time_ns == T0_NS + 1050 * MS and next(taken).stamp_ns < T0_NS + 2500 * MS
 
 
-def test_two_event_cameras_get_a_stretch_each(rles):
+def test_event_buffer_cuts_for_each_camera(rles):
     both = changed(rles, cameras__right=rles.cameras["davis"])
     left, right = stream(0, 3000, 2000, 1), replace(stream(0, 3000, 2000, 2), sensor="right")
     samples = [

@@ -25,7 +25,7 @@ def tie(source_ns, reference_ns):
 
 @dataclass
 class Board:
-    """A board whose clock counts from its power-up; the computer is ahead of its UTC by 37 ms."""
+    """A board with a clock that counts from power-up; the computer is 37 ms ahead of its UTC."""
 
     @property
     def host_clock(self):
@@ -92,7 +92,7 @@ def test_rig_clock_images_get_pulse_times():
     for k in range(60):
         sent_ns = 1_000_000_000 + k * PERIOD_NS
         clock.take("sync", Pulse("cam", sent_ns, k + 9, T0_NS + sent_ns + HOST_AHEAD_NS))
-        # The computer stamps the picture 10 ms late, give or take 3.
+        # The computer timestamps the image 10 ms late, +- 3 ms.
         late_ns = 10_000_000 + int(rng.normal(0, 3_000_000))
         image = picture(T0_NS + sent_ns + HOST_AHEAD_NS + late_ns, 100 + k)
         placed = clock.take("cam", image)
@@ -121,7 +121,7 @@ def test_rig_clock_jumped_images_keep_time():
     assert came[-1].count == 19 and came[-1].stamp_ns == came[-1].host_ns
 
 
-def test_a_pulse_that_the_camera_missed_is_found_and_told():
+def test_rig_clock_missed_pulse_is_reported():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
     number = 100
@@ -149,7 +149,7 @@ def test_rig_clock_fast_lines_start_slowly():
     assert not clock.needs_slow_triggers
 
 
-def test_a_davis_is_tied_by_the_edges_it_saw():
+def test_rig_clock_davis_is_synchronised_by_edges():
     rig = synced("rles", "davis")
     clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)

@@ -16,7 +16,7 @@ def image(time_ms, channel="frames"):
 
 
 def scan(time_ms, has_times=True):
-    """A sweep of 100 ms whose middle is at `time_ms`."""
+    """A scan of 100 ms with its middle at `time_ms`."""
     offset_ns = np.array([0, 100 * MS]) if has_times else None
     points, zeros = np.ones((2, 3), np.float32), np.zeros(2)
     return Scan(
@@ -37,7 +37,7 @@ def alone(losses):
     return n, round(finding.figures["nearest_s"], 9)
 
 
-def test_each_scan_gets_the_picture_nearest_to_its_middle(rig):
+def test_pairing_uses_image_nearest_to_mid_scan(rig):
     pictures = [image(t) for t in (970, 1003, 1036, 1069, 1102, 1135)]
     samples = sorted([scan(1000), scan(1100), *pictures], key=lambda s: s.stamp_ns)
     assert pairs(samples, rig)[0] == [(1000, [1003]), (1100, [1102])]
@@ -73,7 +73,7 @@ def test_a_clock_set_back_does_not_mix_before_and_after(rig):
     assert all(images == [time] for time, images in found) and len(found) >= 9
 
 
-def test_samples_without_a_stamp_are_passed_over(rig):
+def test_pairing_skips_samples_without_timestamp(rig):
     timeless = Image("cam", "frames", None, np.zeros((2, 2), np.uint8))
     assert pairs([timeless, scan(1000), image(1000)], rig)[0] == [(1000, [1000])]
 

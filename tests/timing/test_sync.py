@@ -1,4 +1,4 @@
-"""Streams on one clock: how far apart pairs are, how well that is known, and whether boards may move."""
+"""Streams on one clock: time differences of pairs, their uncertainty, and whether boards may move."""
 
 import numpy as np
 import pytest
@@ -143,7 +143,7 @@ def test_edges_too_quick_are_refused():
     assert clock.problem.figures == {"sigma_ms": 30, "period_ms": 50}
 
 
-def test_edges_of_something_else_are_refused():
+def test_sync_unrelated_edges_are_refused():
     rng = np.random.default_rng(0)
     clock = EdgeClock("davis", 5 * MS)
     clock.set_clock(coarse(0))
@@ -155,7 +155,7 @@ def test_edges_of_something_else_are_refused():
     assert clock.problem.code == "edges.not_the_pulses"
 
 
-def test_a_board_that_begins_anew_is_fitted_anew():
+def test_sync_restarted_board_is_fitted_again():
     clock, _ = run(n=100)
     for k in range(100):
         clock.take_sent(Pulse("davis", k * 50 * MS, k, 0))

@@ -1,4 +1,4 @@
-"""Pictures and the pulses that made them: matched by number, whatever is lost, repeated or late."""
+"""Match images to trigger pulses by number, with lost, repeated and late ones."""
 
 from dataclasses import dataclass, field
 
@@ -90,7 +90,7 @@ class Rig:
             number += 1
             if rng.uniform() >= self.lost_frames:
                 came.append((stamp_ms + 30 + rng.uniform(0, self.lag_ms), image))
-        # Each stream keeps its own order; what comes twice comes at once.
+        # Each stream keeps its own order; duplicates arrive together.
         ordered = []
         for kind in (Pulse, Image):
             latest = 0.0
@@ -133,7 +133,7 @@ def test_trigger_stamp_has_no_jitter():
     first=st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)),
     drift=st.floats(-100e-6, 100e-6),
 )
-def test_no_picture_ever_gets_the_pulse_of_another(
+def test_trigger_never_assigns_wrong_pulse(
     seed, lost_lines, lost_frames, repeated, late, jitter_ms, n_before, first, drift
 ):
     rig = Rig(
@@ -203,7 +203,7 @@ def test_trigger_ambiguous_start_is_refused():
     assert matcher.counts["n_unmatched"] > 150
 
 
-def test_a_camera_that_runs_free_is_refused():
+def test_trigger_free_running_camera_is_refused():
     rng = np.random.default_rng(0)
     matcher = matcher_of()
     matched = []
@@ -214,7 +214,7 @@ def test_a_camera_that_runs_free_is_refused():
     assert len(matched) < 60
 
 
-def test_a_camera_that_is_opened_again_is_matched_again():
+def test_trigger_reopened_camera_is_matched_again():
     first, second = Rig(n=60), Rig(n=60, first_number=0, first_count=61)
     matcher = matcher_of()
     found = []
@@ -231,7 +231,7 @@ def test_a_camera_that_is_opened_again_is_matched_again():
     assert matcher.counts["n_restarts"] == 1
 
 
-def test_a_board_that_begins_anew_is_matched_again():
+def test_trigger_restarted_board_is_matched_again():
     matcher = matcher_of()
     found = []
     for k in range(100):

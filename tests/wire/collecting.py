@@ -1,4 +1,4 @@
-"""`lce-rig collect` in a process of its own, watched by what it says and what it writes."""
+"""`lce-rig collect` in a separate process, observed by its output and files."""
 
 import signal
 import subprocess
@@ -39,7 +39,7 @@ class Collecting:
 
     @property
     def said(self):
-        """What it has written to the terminal so far."""
+        """Output to the terminal so far."""
         return self._log.read_text(errors="replace")
 
     @property

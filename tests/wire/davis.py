@@ -1,4 +1,4 @@
-"""A DAVIS346 made here: what dv-processing offers of an attached one, out of a reel and random events."""
+"""A fake DAVIS346 with dv-processing's interface, fed from a reel and random events."""
 
 import time
 from datetime import timedelta
@@ -52,7 +52,7 @@ class RandomDavis:
         return events
 
     def getNextFrame(self):
-        """Give the picture of the next 40 ms, once it is exposed."""
+        """Return the image of the next 40 ms, once it is exposed."""
         start_us = self._frame * _BATCH_US
         if not self._has_frames or time.time_ns() // 1000 < start_us + _EXPOSURE_US:
             return None

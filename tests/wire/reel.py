@@ -1,4 +1,4 @@
-"""What the senders show: packets and pictures of a board held still at several places, simulated once."""
+"""Data of the senders: packets and images of still boards at several places, simulated once."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -44,7 +44,7 @@ class Reel:
         return [data[k : k + velodyne.DATA_BYTES] for k in range(0, n_bytes, velodyne.DATA_BYTES)]
 
     def pictures(self, camera, placement):
-        """Read the pictures of a placement as they are sent."""
+        """Read a placement's images in sending order."""
         n_bytes = self.picture_bytes[camera]
         data = (Path(self.folder) / f"{camera}.bin").read_bytes()
         first = placement * self.n_pictures
@@ -76,7 +76,7 @@ def make_reel(folder, rig, n_placements, seed=0):
 
 
 def _turn_evenly(packets):
-    """Give all loops the same azimuths: a rotor goes on evenly, whatever is shown next.
+    """Give all loops the same azimuths, so that the rotor turns evenly from one placement to the next.
 
     Each simulated placement begins anywhere within a step, by which it is turned here; 0.2 deg at most.
     """

@@ -1,4 +1,4 @@
-"""Profiles of rigs whose sensors are senders on this computer, and the senders while they run."""
+"""Profiles of rigs with senders on this computer as sensors, and the running senders."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def small_rig(*, is_guided=True):
 
 
 class WireRig:
-    """A rig whose VLP-16 sends while the `with` block lasts; its cameras send when they are read."""
+    """A rig whose VLP-16 sends while the `with` block lasts; its cameras send when read."""
 
     def __init__(self, folder, rig, reel, loops_per_hold, **camera):
         """Prepare."""
@@ -65,7 +65,7 @@ class WireRig:
         return self._sensor.pid
 
     def tell(self, order):
-        """Tell the VLP-16 something; see send_packets.py."""
+        """Send a command to the VLP-16; see send_packets.py."""
         self._sensor.stdin.write(order + "\n")
         self._sensor.stdin.flush()
 

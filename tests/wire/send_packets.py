@@ -21,7 +21,7 @@ from wire.vlp16_packets import gprmc
 _DATA_PER_POSITION = 14
 _SENTENCE_DELAY_NS = 300_000_000
 _BURST_S = 0.004
-# What is late is sent no faster than a port can take it.
+# Late packets are sent no faster than a port can receive them.
 _MOST_AT_ONCE = 40
 _US = struct.Struct("<I")
 _US_AT, _POSITION_US_AT, _PPS_AT, _NMEA_AT = 1200, 0xC6, 0xCA, 0xCE
@@ -71,7 +71,7 @@ class Sensor:
 
 
 def is_heard(port):
-    """Tell whether a process listens on a UDP port."""
+    """Check whether a process listens on a UDP port."""
     table = Path("/proc/net/udp").read_text().splitlines()[1:]
     return any(line.split()[1].endswith(f":{port:04X}") for line in table)
 

@@ -17,7 +17,7 @@ from wire.timing import placement_at
 
 
 def main():
-    """Send until there is nobody to send to."""
+    """Send until the receiver is gone."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("reel", type=Path)
     parser.add_argument("camera")
@@ -44,7 +44,7 @@ def main():
                 number += 1
             else:
                 behind = (time.time_ns() - number * period_ns) // period_ns
-                # A camera that is not read in time skips pictures.
+                # A camera that is not read in time skips images.
                 late, number = late + max(behind, 0), number + max(behind, 0)
                 time.sleep(max(0.0, (number * period_ns - time.time_ns()) * 1e-9))
                 number += 1
@@ -61,7 +61,7 @@ def main():
 
 
 def write_all(data):
-    """Write a picture to standard output; waits while the pipe is full."""
+    """Write an image to standard output; waits while the pipe is full."""
     while data:
         data = data[os.write(1, data) :]
 

@@ -1,4 +1,4 @@
-"""A private OpenSSH server on this computer, with keys of its own, for deployments over a real connection."""
+"""A private OpenSSH server on this computer, with its own keys, for deployments over a real connection."""
 
 import getpass
 import os
@@ -14,7 +14,7 @@ _START_S = 60.0
 
 
 class NoServerError(Exception):
-    """There is no sshd here, or it does not start."""
+    """sshd is missing or does not start."""
 
 
 class Sshd:
@@ -38,7 +38,7 @@ class Sshd:
             *(f"Port {port}", "ListenAddress 127.0.0.1", f"HostKey {folder / 'host_key'}"),
             *(f"AuthorizedKeysFile {folder / 'authorized_keys'}", "PidFile none", "StrictModes no"),
             *("UsePAM no", "PasswordAuthentication no", "PermitRootLogin prohibit-password"),
-            # A login shell's own set-up is slow, and being killed in it could leave locks of its own behind.
+            # A login shell's set-up is slow, and killing it could leave locks behind.
             f"SetEnv HOME={folder}",
             *("Subsystem sftp internal-sftp", "MaxStartups 100", "LogLevel ERROR"),
         ]
@@ -71,7 +71,7 @@ class Sshd:
         self._log.close()
 
     def lose_connections(self):
-        """Kill what serves the connections, and what runs in them; give how many processes these were."""
+        """Kill the connections' server processes and their children; return the number of processes."""
         found = _below(self._process.pid)
         for number in found:
             try:

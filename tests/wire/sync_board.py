@@ -59,7 +59,7 @@ class FakeBoard:
         return self.started_ns + (board_ns - 1000 * self.uptime_us) / (1 + self.drift)
 
     def reset(self, says_hello=True):
-        """Begin anew: time and numbers from 0."""
+        """Restart: time and numbers from 0."""
         with self._lock:
             self._say(b"$LCETG,0,12")
             self.started_ns, self.uptime_us, self.n_sent, self.n_pps = time.time_ns(), 0, 0, 0

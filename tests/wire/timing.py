@@ -9,5 +9,5 @@ LOOP_NS = PACKETS_PER_LOOP * PACKET_NS
 
 
 def placement_at(time_ns, loops_per_hold, n_placements):
-    """Tell which placement of the board is shown at a time of day."""
+    """Return the placement of the board that is shown at a time of day."""
     return time_ns // LOOP_NS // loops_per_hold % n_placements

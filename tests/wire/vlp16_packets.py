@@ -68,7 +68,7 @@ class Vlp16Packets:
         return packets + [packet for _ in range(n_whole) for packet in self._pop()]
 
     def finish(self):
-        """Send what waits, filled up with blocks that follow without returns."""
+        """Send pending data, padded with blocks without returns."""
         n_missing = -len(self._blocks) % velodyne.N_BLOCKS
         if not n_missing:
             return []
@@ -133,7 +133,7 @@ class Vlp16Packets:
 
 
 def free_ports():
-    """Find two UDP ports that nobody uses."""
+    """Find two unused UDP ports."""
     kind = socket.AF_INET, socket.SOCK_DGRAM
     with socket.socket(*kind) as data, socket.socket(*kind) as position:
         data.bind(("", 0))

@@ -36,14 +36,15 @@ from lce_rig.core.results import Observation
 
 NOMINAL_SIGMA_M = 0.01
 """Residuals for the first weights of captures; weights are reported in units of it."""
-# Share of the plane terms that are kept, those with the least propagated variance.
+# Fraction of the plane terms that are kept: those with the smallest propagated variance.
 _KEPT_SHARE = 0.9
-# A capture's error that still counts as noise: from the median and the scatter of all captures' errors.
+# Largest error attributed to noise: in deviations from the median of all captures, and as a multiple of it.
 _DEVIATIONS, _TIMES_MEDIAN = 6.0, 3.0
-# A disagreement below this can be noise, however well the other captures agree.
+# Smaller disagreements count as noise, even if the other captures agree better, m.
 _FLOOR_M = 0.02
 _MAX_SHARE = 0.25
-# More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
+# Maximum number of folds: larger sessions predict and reject several captures at once, so that the cost stays
+# linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
 # Standard deviation of one capture's board plane between camera and LiDAR.
@@ -70,7 +71,7 @@ def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
 
     Args:
         observations: one per capture.
-        board: its specification.
+        board: the board's specification.
 
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
@@ -128,7 +129,7 @@ def solve_planes(
     with M ring ends.
 
     Args:
-        features: of each capture.
+        features: fitted features of each capture.
         sigmas_m: typical errors of a capture's plane and of its ring ends.
         keep: per capture a mask of the plane points to use; all by default.
 
@@ -158,7 +159,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     Edges could replace planes, but a set that requires this is fragile, as edge errors are systematic.
 
     Args:
-        features: of the captures in `problem`.
+        features: fitted features of the captures in `problem`.
         problem: their moments.
         T_cam_lidar: (4, 4) estimate.
 
@@ -175,10 +176,10 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     weak = values < 1 / _MAX_WEAK_SIGMA_M**2
     if not weak.any():
         return
-    # Unit vectors about one direction do not vary along it: the smaller of the two lateral spreads counts.
+    # Unit vectors near one direction do not vary along it, so use the smaller of the two lateral spreads.
     spread = np.linalg.eigvalsh(np.cov(np.array([f.normal for f in features]).T, bias=True))[1]
     finding = UNDETERMINED(
-        # Of each weak direction its main component; translations and rotations are in comparable units.
+        # Main component of each weak direction; translations and rotations have comparable units.
         motions=tuple(dict.fromkeys(MOTIONS[k] for k in np.argmax(np.abs(vectors[:, weak]), axis=0))),
         n_captures=len(features),
         spread_deg=float(np.degrees(np.sqrt(max(spread, 0.0)))),
@@ -193,7 +194,7 @@ def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> l
     normal. No capture loses more than half of its points, so that the filter does not reject whole captures.
 
     Args:
-        features: of all captures.
+        features: fitted features of all captures.
         T_cam_lidar: (4, 4) estimate.
 
     Returns:
@@ -213,7 +214,7 @@ def reject_outliers(
     """Refuse captures whose plane or edges are far from the other captures' prediction, worst first.
 
     Args:
-        features: of the captures in `problem`.
+        features: fitted features of the captures in `problem`.
         problem: their moments, weighted alike.
         T_start: (4, 4) planar initialisation.
 
@@ -223,7 +224,7 @@ def reject_outliers(
     kept = np.arange(problem.n_captures)
     refusals: dict[str, Refusal] = {}
     while True:
-        # Each capture is predicted without its fold; of few captures, each is a fold.
+        # Each capture is predicted without its fold; in small sessions each capture is a fold.
         fold = np.arange(len(kept)) % _MAX_FOLDS
         selection = np.zeros((fold.max() + 1, problem.n_captures))
         selection[:, kept] = fold != np.arange(len(selection))[:, None]
@@ -245,7 +246,7 @@ def reject_outliers(
 
 
 def _excess(errors: Array) -> Array:
-    """Divide errors (F,) by the largest that still counts as noise."""
+    """Divide errors (F,) by the largest error attributed to noise."""
     median = float(np.median(errors))
     deviation = 1.4826 * float(np.median(np.abs(errors - median)))
     return errors / max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)

@@ -1,4 +1,4 @@
-"""Shift of ring ends by the background: the board seems to end earlier there.
+"""Shift of ring ends caused by the background: in front of it, the board seems to end earlier.
 
 A beam that hits both board and background reports the stronger echo. The brighter and nearer the background,
 the earlier the board is lost. If the background is so near that both echoes merge, the range is off the
@@ -32,9 +32,9 @@ _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
 # Groups of columns tested for significance: all, far background, near background.
 _TOGETHER = ((0, 1, 2), (0,), (1, 2))
-# Each column must differ from 0 in this number of captures.
+# Minimum number of captures in which a column differs from 0.
 _MIN_CAPTURES = 5
-# They count if chance produces them in at most one session of this number.
+# Significance: chance produces such shifts in at most one of this number of sessions.
 _ONE_IN = 1000
 
 
@@ -48,7 +48,7 @@ def estimate_shifts(
 
     Args:
         observations: F captures.
-        features: of each.
+        features: fitted features of each capture.
         T_cam_lidar: (4, 4) near the truth.
     """
     from scipy.special import fdtri
@@ -60,7 +60,7 @@ def estimate_shifts(
     # Inside distance = - (change of the extrinsics) - beam's width - shifts.
     by_pose_and_width = np.concatenate([J[:, :7] for _, J, _ in parts])
     A = -np.column_stack([by_pose_and_width, background])
-    # Columns of few captures have no reliable scatter and stay zero, like insignificant ones.
+    # The scatter of columns with few captures is unreliable: they stay zero, like insignificant ones.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
     free = n_having >= _MIN_CAPTURES
     while free.any():

@@ -1,4 +1,4 @@
-"""A proof that a rotation is the global minimum of z^T Q z over SO(3), by Lagrangian duality.
+"""Proof by Lagrangian duality that a rotation is the global minimum of z^T Q z over SO(3).
 
 SO(3) is the set of z = [vec R; 1] with z^T A_i z = 0 for 21 constant matrices A_i: orthonormal columns,
 orthonormal rows and handedness. For any multipliers l and any bound g the matrix
@@ -33,9 +33,9 @@ from lce_rig.calibrate.algorithm_1.registration import (
 )
 from lce_rig.core.geometry import Array
 
-# Largest gap of a global minimum, as a share of its cost: far below what noise changes.
+# Largest gap at a global minimum, relative to its cost: far below the effect of noise.
 _RELATIVE_GAP = 1e-6
-# The same where the cost is nearly zero, as a share of Q's trace: rounding of double precision, with margin.
+# Largest gap for costs near zero, relative to the trace of Q: rounding of double precision, with margin.
 _ROUNDING = 1e-11
 _BARRIER_STEPS = 60
 
@@ -76,7 +76,7 @@ def certify(Q: Array, R: Array) -> Certificates:
         return np.asarray(np.maximum(cost[rows] - bound[rows], 0) + 4 * slack)  # equation (2)
 
     gap = gap_at(_least_eigenvalue(Z), np.arange(len(Z)))
-    # No multipliers help where R is not stationary.
+    # No multipliers exist for an R that is not stationary.
     left = np.flatnonzero((gap > tolerance) & (4 * stationarity <= tolerance))
     if len(left):
         gap[left] = np.minimum(gap[left], gap_at(_raise_least_eigenvalue(Z[left]), left))
@@ -84,7 +84,7 @@ def certify(Q: Array, R: Array) -> Certificates:
 
 
 def solve_globally(Q: Array, R_start: Array) -> tuple[Array, Certificates]:
-    """Minimise z^T Q z over SO(3), from all 24 rotations of a cube where the given start is not certified.
+    """Minimise z^T Q z over SO(3); uncertified starts are retried from the 24 rotations of a cube.
 
     Args:
         Q: (B, 10, 10).

@@ -1,4 +1,4 @@
-"""The cost of any set of captures as a sum of moment matrices, and its solution for many sets at once.
+"""Cost of any subset of captures as a sum of moment matrices, minimised for many subsets at once.
 
 Per capture k the cost is
 
@@ -45,13 +45,13 @@ class Weights(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Solutions:
-    """Solutions of B sets of captures.
+    """Solutions for B subsets of captures.
 
     Attributes:
         R: (B, 3, 3).
         linear: (B, 4): t, then the edge shift.
         edge_ids: (B, n) edge of each ring end.
-        certificates: of each.
+        certificates: certificate of each solution.
     """
 
     R: Array
@@ -75,7 +75,7 @@ class Problem:
 
     Args:
         features: one per capture.
-        weights: of the terms.
+        weights: weights of the terms.
         keep: per capture a mask of the plane points to use; all by default.
     """
 
@@ -117,7 +117,7 @@ class Problem:
         return np.moveaxis(np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T]), 0, -1)
 
     def _mean_of_ends(self, values: Array) -> Array:
-        """Average values (n, ...) of ring ends, which are sorted by capture: (F, ...), 0 without any."""
+        """Average values (n, ...) of the ring ends of each capture, (F, ...); 0 for captures without any."""
         means = np.zeros((self.n_captures, *values.shape[1:]))
         first = np.flatnonzero(np.diff(self.edge_capture, prepend=-1))
         if len(first):
@@ -151,7 +151,7 @@ class Problem:
         Args:
             selection: (B, F).
             T_start: (4, 4) T_cam_lidar for the first association.
-            n_rounds: of association and solution.
+            n_rounds: number of rounds of association and solution.
         """
         R = np.repeat(T_start[None, :3, :3], len(selection), axis=0)
         linear = np.tile(np.append(T_start[:3, 3], 0.0), (len(selection), 1))

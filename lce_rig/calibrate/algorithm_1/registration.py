@@ -20,7 +20,7 @@ from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 N_ROTATION = 9
 # Limit of Newton steps, and length of the last one, rad: the next would be below double precision.
 _MAX_STEPS, _TOLERANCE_RAD = 50, 1e-8
-# Eigenvalues of the linear block below this share of the largest count as unseen.
+# Eigenvalues of the linear block below this fraction of the largest count as unobserved.
 _RELATIVE_FLOOR = 1e-12
 
 
@@ -81,7 +81,7 @@ def linear_unknowns(L: Array, R: Array) -> Array:
 
 
 def rotation_from_directions(targets: Array, sources: Array) -> Array:
-    """Find the R that best turns source into target directions (Wahba's problem).
+    """Find the R that best rotates the source directions onto the target directions (Wahba's problem).
 
     Args:
         targets: (..., n, 3).
@@ -124,7 +124,7 @@ def minimise_on_so3(Q: Array, R_start: Array) -> tuple[Array, Array]:
         length = np.linalg.norm(step, axis=-1)
         candidate = R[active] @ exp_so3(step)
         new_cost, new_gradient, new_hessian = _expand(Q[active], candidate)
-        # Near the minimum f is known no better than its rounding, and Newton's step is trusted instead.
+        # Near the minimum rounding dominates f, so accept Newton's step without comparing costs.
         is_tiny = is_convex & (damping[active] == 0) & (length < 1e-6)
         is_better = (new_cost <= cost[active] * (1 + 1e-14) + 1e-15 * trace[active]) | is_tiny
         taken = active[is_better]

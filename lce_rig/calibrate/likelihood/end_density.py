@@ -1,4 +1,4 @@
-"""Density, score and information of the distance between a ring's last return on the board and the edge.
+"""Density, score and information of the distance from a ring's last return on the board to the edge.
 
 In units of the step to the next ray, let x be the distance of the last return inside the edge, less half a
 step, beam width included. Without noise x is uniform in -1/2..1/2: the edge lies between the last ray that
@@ -67,14 +67,14 @@ def _exponential_with_noise(x: Array, t: Array) -> Array:
 
     s = t / _LOST_STEPS
     z = x / t - s
-    # Both forms are equal; each overflows where the other does not.
+    # Both forms are equal; choose the one that does not overflow.
     below = np.exp(-0.5 * (x / t) ** 2) * erfcx(-np.minimum(z, 0.0) / np.sqrt(2)) / 2
     above = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 0.0)) * ndtr(z)
     return np.asarray(np.where(z < 0, below, above) / _LOST_STEPS)
 
 
 def information(blur: Array, lost_share: float) -> Array:
-    """Compute Fisher's information (M,) of the edge's place, the mean of (d ln p / dx)^2, per step^2."""
+    """Compute Fisher's information (M,) on the edge's position, the mean of (d ln p / dx)^2, per step^2."""
     table = _log_informations()
     row = float(np.interp(lost_share, _SHARES, np.arange(len(_SHARES))))
     low = min(int(row), len(_SHARES) - 2)
@@ -104,7 +104,7 @@ def edge_products(
     first = np.flatnonzero(np.diff(group, prepend=-1))
     counts = np.diff(first, append=len(J))
     products = np.zeros((len(first), J.shape[1] + 1, J.shape[1] + 1))
-    # A ring has two ends on a board, and more on one that is partly hidden.
+    # A ring has two ends on a board, and more on a partly hidden one.
     for n in np.unique(counts).tolist():
         at = first[counts == n, None] + np.arange(n)
         products[counts == n, :-1] = np.swapaxes(J[at], 1, 2) @ weighted[at]
@@ -116,7 +116,7 @@ def edge_products(
 
 @lru_cache(maxsize=1)
 def _log_informations() -> Array:
-    """Tabulate ln of the information by lost share and blur."""
+    """Tabulate ln of the information by lost fraction and blur."""
     x = np.linspace(-1.0, 1.0, 2001)[:, None]
     # Finest where the core rises and falls.
     at = np.sign(x) * np.abs(x) ** 2 * (12.0 + 8.0 * _BLURS)

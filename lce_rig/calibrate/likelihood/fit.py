@@ -1,4 +1,4 @@
-"""The optimum: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
+"""The optimum: extrinsics of cameras that share a LiDAR, board poses, constant errors, noise levels.
 
 Fisher scoring: Gauss-Newton on ranges and images, mean information and score for the density of ring ends
 (`end_density`). Noise levels are fitted in between, by the evidence: all unknowns are integrated out
@@ -26,13 +26,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
 
-# Maximum number of steps between fits of the levels, and of the last steps.
+# Maximum number of steps between two fits of the levels, and after the last one.
 STEPS, _LAST_STEPS = 3, 20
-# Length of the next step that ends them, in standard deviations of all unknowns together.
+# Step lengths below which these end, in standard deviations of all unknowns together.
 NEAR, _SETTLED = 0.1, 5e-3
 # Rounds of the search for noise levels, each followed by a new linearisation.
 _LEVEL_ROUNDS = (8, 4, 8)
-# First blurs of ring ends, rad: until the edge shift is known, all of them may lie outside their intervals,
+# First blurs of ring ends, rad. Until the edge shift is known, all ends may lie outside their intervals,
 # where a sharp density is flat.
 BLURS_RAD = (4e-3, 1.5e-3)
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
@@ -41,7 +41,7 @@ _BELOW, _ABOVE = -4.6, 3.0
 _HUBER, _FARTHEST = 1.5, 1e6
 # Number of plain steps before Anderson mixing, and of steps that it combines.
 _PLAIN, _MIXED = 3, 5
-# Errors of lens and board that `Priors.held` holds.
+# Errors of lens and board that `Priors.held` fixes.
 _HELD = ("pattern_offset", "intrinsics")
 # Squared length of a step that counts as diverged, in standard deviations.
 _DIVERGED = 1e12
@@ -52,17 +52,17 @@ AnyTerms = TypeVar("AnyTerms")
 
 
 class Optimum(ABC):
-    """Covariance of the G unknowns z that captures share, by cause."""
+    """Covariance of the G unknowns z shared by all captures, by cause."""
 
     @property
     @abstractmethod
     def cost(self) -> Quadratics:
-        """Of the F captures, in z."""
+        """Quadratic cost of the F captures in z."""
 
     @property
     @abstractmethod
     def profiled(self) -> Mapping[str, tuple[Indices, float]]:
-        """Places in z and standard deviation of each error of lens and board, by name."""
+        """Index in z and standard deviation of each error of lens and board, by name."""
 
     @cached_property
     def covariances(self) -> tuple[Array, Array]:
@@ -101,12 +101,12 @@ class Optimum(ABC):
 
 @dataclass(frozen=True, eq=False)
 class JointEstimate(Optimum):
-    """The optimum, with G unknowns z that the captures share.
+    """The optimum, with G unknowns z shared by all captures.
 
     Attributes:
         terms: linearised there.
-        levels: of the noise.
-        priors: of the constants.
+        levels: noise levels.
+        priors: prior standard deviations of the constant errors.
         placement: (F,) number of the placement that each capture shows; each its own without cameras.
         captures: (F,) their names, sorted.
     """
@@ -129,12 +129,12 @@ class JointEstimate(Optimum):
 
     @cached_property
     def cost(self) -> Quadratics:
-        """Of the F captures, in z."""
+        """Quadratic cost of the F captures in z."""
         return replace(self.reduced.cost, placement=self.placement)
 
     @property
     def profiled(self) -> Mapping[str, tuple[Indices, float]]:
-        """Places in z and standard deviation of each error of lens and board, by name."""
+        """Index in z and standard deviation of each error of lens and board, by name."""
         return profiled(self.state.layout, self.priors)
 
     @cached_property
@@ -154,13 +154,13 @@ class JointEstimate(Optimum):
 
     @property
     def cov(self) -> Array:
-        """(C, 6, 6) of each, everything else marginalised, tangent (translation m, rotation rad)."""
+        """Covariance (C, 6, 6) of the extrinsics, marginalised; tangent (translation m, rotation rad)."""
         J = self.to_extrinsics
         return np.asarray(J @ self.cov_z @ np.swapaxes(J, 1, 2))
 
 
 def profiled(layout: Layout, priors: Priors) -> dict[str, tuple[Indices, float]]:
-    """List the places in z and the standard deviation of each error of lens and board, by name."""
+    """List index in z and standard deviation of each error of lens and board, by name."""
     found = {
         "plate_size": (layout.plate, priors.plate_m),
         "board_bow": (layout.z.of(["bow"]), priors.bow_m),
@@ -190,10 +190,10 @@ def maximise_likelihood(
         cameras: observations of each.
         board: the board.
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
-        priors: of the constant errors.
+        priors: prior standard deviations of the constant errors.
         usual: typical noise levels.
         pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
-        lenses: of each camera, with errors as unknowns, the base last; None for exact lenses.
+        lenses: lenses of each camera, with errors as unknowns, the base last; None for exact lenses.
     """
     names, scans, images = stack_captures(cameras, board, lenses or [None] * len(cameras), pose_ratios)
     base = None if len(images) == len(cameras) else len(cameras)
@@ -217,7 +217,7 @@ def stack_captures(
     lenses: Sequence[SessionLens | None],
     pose_ratios: Sequence[Mapping[str, float]] | None,
 ) -> tuple[tuple[str, ...], StackedScans, list[StackedImages]]:
-    """Stack the captures of all cameras, sorted by name; arguments as of `maximise_likelihood`."""
+    """Stack the captures of all cameras, sorted by name; arguments as in `maximise_likelihood`."""
     surfaces = {o.capture: o.surface for camera in cameras for o in camera}
     order = {name: k for k, name in enumerate(sorted(surfaces))}
     by_base = {name: each.image for name, each in surfaces.items() if isinstance(each, PatternBoard)}
@@ -249,7 +249,7 @@ def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual
     Args:
         lidars: the boards.
         board: the board.
-        priors: of the constant errors.
+        priors: prior standard deviations of the constant errors.
         usual: typical noise levels.
     """
     scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
@@ -284,7 +284,7 @@ def approach(terms: Terms, levels: Levels, priors: Priors) -> Terms:
 
 
 def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
-    """Find the optimum at given levels in at most `n_steps` steps, until the next one is short."""
+    """Find the optimum at given levels in at most `n_steps` steps; stop at the first short step."""
 
     def reduce(here: Terms) -> Reduced:
         return assemble(here, levels, priors)
@@ -302,7 +302,7 @@ def descend(
     n_steps: int,
     short: float,
 ) -> AnyTerms:
-    """Find the optimum of linearised terms in at most `n_steps` steps, until the next one is short.
+    """Find the optimum of linearised terms in at most `n_steps` steps; stop at the first short step.
 
     The mean information of ring ends is not the curvature of their cost: plain steps are five times too short
     in some directions and oscillate in others. Anderson mixing corrects them by the effect of earlier steps.
@@ -363,16 +363,16 @@ def fit_levels(
         terms: linearised near the optimum.
         start: levels to start from.
         usual: centre of their prior; lasers without offsets there have none.
-        priors: of the constants.
-        n_rounds: of the search, at most.
-        names: of the levels to find; others are the usual ones.
+        priors: prior standard deviations of the constant errors.
+        n_rounds: number of rounds of the search, at most.
+        names: names of the levels to find; others are the usual ones.
     """
     from scipy.optimize import minimize
 
     names = [name for name in names if name != "laser_m" or usual.laser_m > NO_LASER_M]
     sigma = np.array([LOG_SIGMA[name] for name in names])
     middle = np.log([getattr(usual, name) for name in names])
-    # Thousands of ranges and a few captures determine one level each: without a scale, the search zigzags.
+    # Thousands of ranges but few captures determine a level: without scaling, the search zigzags.
     n_measured = _count_measurements(terms, start)
     scale = np.sqrt(4 * np.array([n_measured[name] for name in names]) + 2 / sigma**2)
 
@@ -395,14 +395,14 @@ def fit_levels(
 
 
 def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
-    """Estimate the number n of measurements that determine each level: its logarithm to 1 / (2 n)^1/2."""
+    """Estimate how many measurements n determine each level; its logarithm has sigma 1 / (2 n)^1/2."""
     n_returns = terms.ranges.n_returns
     n_ends, n_backed = len(terms.edges.rows), np.count_nonzero(terms.edges.is_backed)
     n_images = sum(len(images.capture) for images in terms.images)
     return {
         "range_m": float(n_returns.sum()),
         "ring_m": float(np.count_nonzero(n_returns)),
-        # Only ring ends near the ends of their intervals show the blur.
+        # Only ring ends near the limits of their intervals determine the blur.
         "edge_rad": 0.3 * (n_ends - n_backed),
         "backed_rad": 0.3 * n_backed,
         "lost_share": 0.5 * levels.lost_share * n_ends,
@@ -416,7 +416,7 @@ def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
 
 
 def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
-    """Weight captures (F,) by their influence on the extrinsics, those of a placement as one."""
+    """Weight captures (F,) by their influence on the extrinsics; captures of one placement count as one."""
     once = weigh_placements(placement, terms.images)
     cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
     return once * by_influence(cost, np.concatenate(extrinsics_by_unknowns(terms)))
@@ -437,7 +437,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
     twice.
 
     Args:
-        cost: of the captures at the optimum, those of a placement with the weight of one.
+        cost: quadratic cost of the captures at the optimum, those of a placement with the weight of one.
         J: (e, G) derivative of the extrinsics.
 
     References:
@@ -455,7 +455,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
 
 
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
-    """Weight captures (F,) so that those of one placement, with the same errors, count as one.
+    """Weight captures (F,) so that those of one placement, which share its errors, count as one.
 
     Of a placement that cameras saw in different numbers of captures, the smallest number counts.
     """

@@ -1,4 +1,4 @@
-"""The likelihood of one camera's captures under assumptions other than those of its estimate.
+"""Likelihood of one camera's captures under assumptions other than those of its estimate.
 
 It serves to judge an estimate. Every placement has full weight, and the images' errors begin at their usual
 levels. In the estimate, captures that contradict each other lose weight and raise the noise by which they are
@@ -39,14 +39,14 @@ _TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.array([0.0, 0.
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """F captures of one camera under M mountings, settled.
+    """F captures of one camera under M mountings, at the optimum.
 
     Attributes:
         terms: linearised at the optimum; the images of each mounting are those of a camera. Those of a camera
             that is the base are the last.
-        images: of all mountings.
-        levels: of the noise.
-        priors: of the constants.
+        images: images of all mountings.
+        levels: noise levels.
+        priors: prior standard deviations of the constant errors.
         captures: (F,) names, sorted.
         mounting: (F,) number of each capture's mounting.
         T_lidar_board: (F, 4, 4) poses of the boards by the estimate, or by the scan alone if it has none.
@@ -87,7 +87,7 @@ class Hypothesis:
 
     @cached_property
     def with_fitted_noise(self) -> "Hypothesis":
-        """The same with the levels of the images' errors fitted at the present expansion point."""
+        """Return a copy with the levels of the images' errors fitted at the present expansion point."""
         usual = self.levels.with_usual_images
         fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
         return replace(self, levels=fitted)
@@ -98,10 +98,10 @@ class Hypothesis:
         mounting: NDArray[np.intp] | None = None,
         T_cam_lidar: Array | None = None,
     ) -> "Hypothesis":
-        """Settle under other assumptions.
+        """Find the optimum under other assumptions.
 
         Args:
-            priors: of the constants; the present ones by default.
+            priors: prior standard deviations of the constant errors; the present ones by default.
             mounting: (F,) of the captures; the present one by default.
             T_cam_lidar: (M, 4, 4) of each mounting, to start from.
         """
@@ -141,9 +141,9 @@ def at_full_weight(
 
     Args:
         joint: the estimate.
-        observations: of the camera, also of captures that the estimate does not use.
-        lenses: of the camera, and of one that is the base; None if exact.
-        camera: its number.
+        observations: observations of the camera, also of captures that the estimate does not use.
+        lenses: lenses of the camera, and of one that is the base; None if exact.
+        camera: index of the camera.
     """
     board, T_cam_lidar = joint.terms.board, joint.state.T_cam_lidar[camera]
     names, scans, images = stack_captures([observations], board, lenses, None)

@@ -1,4 +1,4 @@
-"""Residuals of board poses in images from T_cam_lidar T_lidar_board.
+"""Residuals between board poses in images and T_cam_lidar T_lidar_board.
 
 Corners enter by their fitted pose and its covariance, which hold their information to first order. Besides
 their noise, an image's pose has errors that its corners share: the lens model's misfit in that part of the
@@ -74,7 +74,7 @@ def stack_images(
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them, or poses by the first of two LiDARs, which have no lens.
-        pattern_offset_m: of the pattern's centre from the plate's.
+        pattern_offset_m: standard deviation of the pattern's centre from the plate's.
         lens: whose errors are unknowns; None for a lens that is exact.
     """
     T = np.array([image.T_cam_board for image in images])
@@ -86,7 +86,7 @@ def stack_images(
     shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
     shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
     errors = np.zeros((len(T), 6, 3))
-    # Squares larger by a fraction put the pattern's centre as much farther away.
+    # Squares that are larger by a fraction move the pattern's centre away by the same fraction.
     errors[:, :3, 0] = t + R @ [*pattern_offset_m, 0.0]
     errors[:, :3, 1:] = -R[:, :, :2]
     of_lens, turns = np.zeros((0, 0)), np.zeros((3, 0))
@@ -97,7 +97,7 @@ def stack_images(
 
 
 def image_rows(images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, errors: Array) -> Array:
-    """Linearise the tangent from T_cam_board, moved by constant errors, to T_cam_lidar T_lidar_board.
+    """Linearise the tangent from T_cam_board, with constant errors, to T_cam_lidar T_lidar_board.
 
     Args:
         images: P of one camera.

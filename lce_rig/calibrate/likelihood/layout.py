@@ -1,4 +1,4 @@
-"""Layout of the unknowns: the name of each, and its place in every vector, matrix and row of the likelihood.
+"""Layout of the unknowns: their names and indices in all vectors, matrices and rows of the likelihood.
 
 The unknowns of each capture are y = [pose, own_shift]: the tangent of T_lidar_board, and the capture's own
 shift of ring ends. All captures share
@@ -80,22 +80,22 @@ OWN = Columns(_OWN)
 
 
 def image_columns(n_optics: int) -> Columns:
-    """Name the columns of the row of a board's pose in an image of a camera with n unknowns of its lens."""
+    """Name the columns of an image's row: a board's pose for a camera with n unknown lens parameters."""
     return Columns({"camera": 6, "pose": 6, **BOARD, "optics": n_optics, "residual": 1})
 
 
 class Layout:
-    """Places of the unknowns of C cameras and L rings.
+    """Indices of the unknowns of C cameras and L rings.
 
     Args:
         n_optics: number of unknowns of each lens.
         n_rings: L.
-        lens_of: number of the lens of each camera, its own by default. A camera that moved counts as two.
-        base: the camera in whose frame the boards' poses are, without a LiDAR.
+        lens_of: lens index of each camera; by default each has its own. A camera that moved counts as two.
+        base: without a LiDAR, the camera in whose frame the boards' poses are expressed.
 
     Attributes:
-        z: places in the vector of the unknowns that captures share.
-        row: places in a row [y, z, residual].
+        z: indices in the vector of the unknowns shared by all captures.
+        row: indices in a row [y, z, residual].
     """
 
     def __init__(
@@ -117,44 +117,44 @@ class Layout:
         self.row = Columns({**_OWN, **common, "residual": 1})
 
     def camera(self, c: int) -> Indices:
-        """Places in z of a camera's tangent (6,)."""
+        """Indices in z of a camera's tangent (6,)."""
         return self.z.of([f"camera {c}"])
 
     @property
     def cameras(self) -> Indices:
-        """Places in z of all cameras' tangents (C, 6)."""
+        """Indices in z of all cameras' tangents (C, 6)."""
         return np.array([self.camera(c) for c in range(self.n_cameras)], dtype=np.intp).reshape(-1, 6)
 
     def errors(self, c: int) -> Indices:
-        """Places in z of the errors that move the poses in a camera's images: print and lens."""
+        """Indices in z of the errors that shift the board poses in a camera's images: pattern and lens."""
         return self.z.of([*BOARD, f"optics {self._lens_of[c]}"])
 
     def optics(self, c: int) -> Indices:
-        """Places in z of the errors of a camera's lens."""
+        """Indices in z of the errors of a camera's lens."""
         return self.z.of([f"optics {self._lens_of[c]}"])
 
     @property
     def plate(self) -> Indices:
-        """Places in z of the errors of the plate's width and height (2,)."""
+        """Indices in z of the errors of the plate's width and height (2,)."""
         return self.z.of(["shifts"])[PLATE]
 
     @property
     def shape(self) -> Indices:
-        """Places in z of the plate's bow, width and height (4,)."""
+        """Indices in z of the plate's bow, width and height (4,)."""
         return np.concatenate([self.z.of(["bow"]), self.plate])
 
     @property
     def lasers(self) -> Indices:
-        """Places in z of the lasers' errors (3, L), in the order of `LASER`."""
+        """Indices in z of the lasers' errors (3, L), in the order of `LASER`."""
         return self.z.of(LASER).reshape(len(LASER), -1)
 
     @property
     def fields(self) -> Indices:
-        """Places in z of the displacements of points (6,)."""
+        """Indices in z of the displacements of points (6,)."""
         return self.z.of(_FIELDS)
 
     def image_row(self, c: int) -> Indices:
-        """Places in a row of the columns of `image_columns` for a camera."""
+        """Indices in a camera's row of the columns of `image_columns`."""
         return self.row.of([f"camera {c}", "pose", *BOARD, f"optics {self._lens_of[c]}", "residual"])
 
 
@@ -185,7 +185,7 @@ class State:
         n_optics: Sequence[int],
         base: int | None = None,
     ) -> "State":
-        """Start with constant errors of zero; `n_optics` and `base` as of `Layout`."""
+        """Start with constant errors of zero; `n_optics` and `base` as in `Layout`."""
         layout = Layout(n_optics, n_rings, base=base)
         return cls(layout, T_cam_lidar, T_lidar_board, np.zeros(len(T_lidar_board)), np.zeros(layout.z.size))
 
@@ -207,7 +207,7 @@ class State:
 
     @property
     def squares(self) -> float:
-        """Relative error of the squares' size, positive for squares that are larger than the profile's."""
+        """Relative error of the squares' size, positive if they are larger than the profile states."""
         return float(self.z[self.layout.z["squares"]][0])
 
     def common_to(self, layout: Layout, rings: NDArray[np.int16], other_rings: NDArray[np.int16]) -> Array:
@@ -216,7 +216,7 @@ class State:
         Args:
             layout: the other one.
             rings: (L,) ring numbers of this one.
-            other_rings: of the other one.
+            other_rings: rings of the other layout.
         """
         z = np.zeros(layout.z.size)
         _, here, there = np.intersect1d(rings, other_rings, return_indices=True)
@@ -226,7 +226,7 @@ class State:
         return z
 
     def moved(self, z: Array, y: Array) -> "State":
-        """Apply a step z (G,) and y (F, 7)."""
+        """Return the state after a step z (G,) and y (F, 7)."""
         moved, cameras = self.z + z, self.layout.cameras
         moved[cameras] = 0
         return State(

@@ -1,4 +1,4 @@
-"""Levels of the errors in the likelihood, and their priors."""
+"""Noise levels in the likelihood, and their priors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from lce_rig.core.geometry import Array
 
 @dataclass(frozen=True)
 class Levels:
-    """Standard deviations of errors that differ from one measurement to the next; estimated.
+    """Standard deviations of errors that vary between measurements; estimated.
 
     The defaults are from recordings; `LOG_SIGMA` holds their prior standard deviations.
 
@@ -47,17 +47,17 @@ class Levels:
         return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
 
     def ratio(self, name: str) -> float:
-        """Return a level in units of the usual one."""
+        """Return a level relative to its default."""
         return float(getattr(self, name) / getattr(Levels(), name))
 
     @property
     def largest_of_images(self) -> float:
-        """The largest `ratio` of the images' levels."""
+        """Largest `ratio` of the images' levels."""
         return max(self.ratio(name) for name in OF_IMAGES)
 
     @property
     def with_usual_images(self) -> "Levels":
-        """Set the images' levels to the usual ones."""
+        """Reset the images' levels to their defaults."""
         return replace(self, **{name: getattr(Levels(), name) for name in OF_IMAGES})
 
 
@@ -87,7 +87,7 @@ _EXACT_M, _EXACT = 1e-6, 1e-6
 
 @dataclass(frozen=True)
 class Priors:
-    """Standard deviations a priori of the constant errors, which are the same in every capture.
+    """Prior standard deviations of the constant errors, which are the same in every capture.
 
     An estimate holds the pattern's place and the lenses, which small errors of the model would move. With
     both free, the results of two recorded sessions of one rig (rlfs01, rlfs02) differ by 7.1 mm at the
@@ -149,7 +149,7 @@ class Priors:
 
     @property
     def held(self) -> "Priors":
-        """Hold the pattern's place and the lenses."""
+        """Fix the pattern's position and the lenses."""
         return replace(self, pattern_m=_EXACT_M, optics=_EXACT)
 
     @property
@@ -167,7 +167,7 @@ def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     offset_m = max(options.range_offset_sigma_m, _EXACT_M)
     priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     if not options.has_rings:
-        # No axis, so no lens beside it.
+        # Without an axis there is no lens beside it.
         priors = replace(priors, lateral_m=_EXACT_M, vertical_m=_EXACT_M)
     if options.tolerances is not None:
         known = options.tolerances

@@ -1,4 +1,4 @@
-"""All terms at one state, and their normal equations for any noise levels.
+"""All terms at one state, and their normal equations for given noise levels.
 
 A capture's own unknowns y enter only its own terms: the matrix is an arrow head, and y is eliminated capture
 by capture (Schur complement). `layout` names the unknowns.
@@ -27,12 +27,12 @@ from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 
-# Of the logarithm of a level, for differences.
+# Step of a level's logarithm for numerical differences.
 _LOG_STEP = 1e-4
 # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
 # extrinsics. This much of it is left.
 _MEAN_FLOOR = 1e-6
-# Standard deviation of the pose of a camera that is the base, m and rad.
+# Standard deviation of the pose of a camera that is the base, m and rad: practically fixed.
 _BASE_SIGMA = 1e-6
 _OF_PROFILE = frozenset(BOARD)
 
@@ -43,12 +43,12 @@ class Terms:
 
     Attributes:
         scans: rays of F captures.
-        images: of each camera.
+        images: images of each camera.
         board: the plate's size.
         state: values of the unknowns.
         trust: (F,) weight of each capture.
-        ranges: of points, at the state.
-        edges: of ring ends.
+        ranges: sums of returns, at the state.
+        edges: rows of ring ends.
         image_rows: linearised, of each camera.
     """
 
@@ -86,7 +86,7 @@ def linearise(
 
 
 class Products(NamedTuple):
-    """Weighted products of rows, of n groups of measurements whose errors are independent.
+    """Weighted products of rows, for n groups of measurements with independent errors.
 
     Attributes:
         capture: (n,) of each group.
@@ -114,7 +114,7 @@ class Summed(NamedTuple):
 
 
 class Known(NamedTuple):
-    """Priors of the G unknowns that captures share.
+    """Priors of the G unknowns shared by all captures.
 
     Attributes:
         information: (G, G).
@@ -174,7 +174,7 @@ _PARTS: dict[Part, tuple[str, ...]] = {
 
 
 def _ring_places(columns: Columns, layout: Layout) -> Indices:
-    """List the places (L, c) in [y, z, residual] of each ring's columns."""
+    """List the indices (L, c) in [y, z, residual] of each ring's columns."""
     laser = dict(zip(LASER, layout.row.of(LASER).reshape(len(LASER), -1), strict=True))
     shape = layout.n_rings, 1
     return np.column_stack(
@@ -187,7 +187,7 @@ class Reduced:
     """Normal equations with the captures' own unknowns eliminated.
 
     Attributes:
-        cost: of F captures in z, at its present value.
+        cost: quadratic cost of F captures in z, at its present value.
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
@@ -202,7 +202,7 @@ class Reduced:
 
     @cached_property
     def gradient(self) -> Array:
-        """(G,) by z, of all captures and priors."""
+        """Gradient (G,) by z, over all captures and priors."""
         return np.asarray(self.cost.gradients.sum(axis=0) + self.cost.prior_gradient)
 
     @property
@@ -214,7 +214,7 @@ class Reduced:
 
     @cached_property
     def step(self) -> tuple[Array, Array]:
-        """Towards the optimum: z (G,) and y (F, 7)."""
+        """Newton step towards the optimum: z (G,) and y (F, 7)."""
         # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
         z = np.asarray(-np.linalg.solve(self.cost.information, self.gradient))
         return z, -self.own_steps @ np.append(z, 1.0)
@@ -244,25 +244,25 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
     """Weight all terms, eliminate the captures' own unknowns and add the priors.
 
     Args:
-        terms: of F captures.
-        levels: of their noise.
-        priors: of the constants.
+        terms: linearised terms of F captures.
+        levels: noise levels of the terms.
+        priors: prior standard deviations of the constant errors.
     """
     return _reduce(terms, sum_products(terms, levels), levels, priors)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """-2 ln p(data | levels) as a function of some levels, with its derivative by their logarithms.
+    """-2 ln p(data | levels) as a function of some levels, with its derivatives by their logarithms.
 
     By a level, it is the mean of v^T dM v over all unknowns given the data, with M the products of
     [y, z, 1] and their priors, and the change of the covariances' log determinants. Only M is differentiated
     by differences.
 
     Attributes:
-        terms: of F captures.
-        priors: of the constants.
-        names: of the levels that vary.
+        terms: linearised terms of F captures.
+        priors: prior standard deviations of the constant errors.
+        names: names of the levels that vary.
         others: sum of the products that depend on other levels alone.
     """
 
@@ -273,7 +273,7 @@ class Evidence:
 
     @classmethod
     def of(cls, terms: Terms, levels: Levels, priors: Priors, names: Sequence[str]) -> "Evidence":
-        """Sum the products that depend on none of the levels named, at their present values."""
+        """Sum the products that depend on none of the named levels, at their present values."""
         fixed = [part for part, of_part in _PARTS.items() if not set(of_part) & set(names)]
         others = _sum(terms, [each for part in fixed for each in part(terms, levels)])
         return cls(terms, priors, names, others)
@@ -313,7 +313,7 @@ class Evidence:
 
 
 def _places(part: Products) -> tuple[Indices, Indices, Indices]:
-    """Index the places (n, c, c) of products in matrices (F, n, n) of all unknowns."""
+    """Index the elements (n, c, c) of products in matrices (F, n, n) of all unknowns."""
     return part.capture[:, None, None], part.place[:, :, None], part.place[:, None, :]
 
 
@@ -346,7 +346,7 @@ def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced
         summed: products of rows of n_own own unknowns, G others and the residual.
         trust: (F,) weight of each capture.
         n_own: number of own unknowns of a capture.
-        known: of the others.
+        known: levels that do not vary.
     """
     M, log_volume = summed
     own, common = slice(0, n_own), slice(n_own, None)
@@ -365,7 +365,7 @@ def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced
 
 
 def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
-    """Build the priors of the unknowns that captures share.
+    """Build the priors of the unknowns shared by all captures.
 
     Range offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """

@@ -1,4 +1,4 @@
-"""Residuals of planes and ring ends along the LiDAR's rays for boards at given poses, for the likelihood.
+"""Residuals of planes and ring ends along the LiDAR's rays for boards at given poses.
 
 Ranges. A ray u meets a board's plane n . p = h at r = h / (n . u) and reads, off by the range offset o of its
 laser and displaced by f theta (the lens, below) and by the laser's errors a of azimuth and elevation,
@@ -80,7 +80,8 @@ from lce_rig.core.results import LidarBoard
 _MEAN_M = 0.008
 # Half a beam's width, and what the outline found in the scan may be off by.
 _BORDER_M = 0.02
-# A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
+# Shortest step, m: on an edge parallel to its ring, a ring end has almost no step and determines the edge
+# less accurately.
 _SHORTEST_STEP_M = 2e-4
 
 
@@ -125,7 +126,7 @@ class StackedScans:
 
     @cached_property
     def group(self) -> Indices:
-        """Index (N,) of each return's pair of capture and ring, of F L in all; ascending."""
+        """Index (N,) of each return's capture and ring, 0 to F L - 1; ascending."""
         return np.asarray(self.capture * len(self.rings) + self.ring)
 
     @cached_property
@@ -135,7 +136,7 @@ class StackedScans:
 
 
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
-    """Remove returns near the border, where the beam also hits the background and reads too long."""
+    """Remove returns near the border, where the beam also hits the background and ranges are too long."""
     T = lidar.T_lidar_board
     xy = ((np.asarray(lidar.points, dtype=np.float64) - T[:3, 3]) @ T[:3, :3])[:, :2]
     keep = np.all(np.abs(xy) < np.array([board.width_m, board.height_m]) / 2 - _BORDER_M, axis=1)
@@ -185,7 +186,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
 
 
 def no_scans(n_captures: int) -> StackedScans:
-    """Stack captures that no LiDAR saw; one ring stands for its errors, which nothing measures."""
+    """Stack captures that no LiDAR saw; a single ring, never measured, represents its errors."""
     at, none, rays, fields = np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 6))
     return StackedScans(
         n_captures=n_captures,
@@ -208,7 +209,7 @@ def no_scans(n_captures: int) -> StackedScans:
 
 
 def spread(scans: StackedScans, captures: Indices, n_captures: int) -> StackedScans:
-    """Number the stacked captures anew, as some of more captures (n,), ascending, that other sensors saw."""
+    """Renumber the stacked captures as a subset (n,), ascending, of captures seen by other sensors."""
     weight = np.ones(n_captures)
     weight[captures] = scans.weight
     return replace(
@@ -238,7 +239,7 @@ def correct_points(lidar: LidarBoard, board: Board, rings: NDArray[np.int16], st
 
     Args:
         lidar: the board as measured.
-        board: its size.
+        board: the board's size.
         rings: (L,) ring numbers of the state's lasers, ascending; other rings count as exact.
         state: the estimate.
     """
@@ -262,7 +263,7 @@ def bow_heights(on_board: Array, board: Board) -> Array:
 
     Args:
         on_board: (..., 2 or 3) points, frame board, m.
-        board: its size.
+        board: the board's size.
     """
     half = np.array([board.width_m, board.height_m]) / 2
     return np.asarray(1 / 3 - (on_board[..., :2] / half) ** 2)
@@ -319,7 +320,7 @@ def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     by_ring = scans.n_captures, len(scans.rings)
     sums = np.zeros((by_ring[0] * by_ring[1], RING.size, RING.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
-    # A product of matrices for each ring: several times faster than sums of products of columns.
+    # One matrix product per ring is several times faster than sums of products of columns.
     if len(v):
         sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
     n_returns = np.bincount(scans.group, minlength=len(sums)).astype(np.float64)
@@ -387,7 +388,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     here = range_m[:, None] * scans.end_rays - t + off
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off
     xy, xy_next = (np.einsum("mji,mj->mi", R[:, :, :2], p) for p in (here, beyond))
-    # A ring leaves the board by the nearest of the edges that it crosses outwards.
+    # A ring leaves the board at the nearest edge that it crosses outwards.
     anchors, normals = (of_edges[:, :2] for of_edges in board.edges())
     steps_m = (xy_next - xy) @ normals.T
     distances_m = np.sum(anchors * normals, axis=1) - xy @ normals.T + state.shifts[0] - steps_m / 2

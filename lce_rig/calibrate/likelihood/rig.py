@@ -1,4 +1,4 @@
-"""The likelihood of a rig: LiDARs and cameras with one pose each, and boards that any of them saw.
+"""Likelihood of a rig: LiDARs and cameras with one pose each, and the boards that any of them saw.
 
 The base is the first LiDAR; boards have their poses in its frame. The terms of each LiDAR (`model`) are those
 of its own frame, in which the base has the pose T_m. With x the tangent of T_m and y that of a board's pose
@@ -46,7 +46,7 @@ from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, relative_pose, skew
 
-# Maximum number of steps, and the length of the next one that ends them, in standard deviations.
+# Maximum number of steps, and step length below which they end, in standard deviations.
 _STEPS, _SETTLED = 20, 5e-3
 _POSE = OWN["pose"].stop
 # Standard deviation of a LiDAR's lens, lateral and vertical, m, from errors of the ring ends' model that all
@@ -78,7 +78,7 @@ class RigTerms:
 
     @cached_property
     def places(self) -> list[Indices]:
-        """Places of each LiDAR's unknowns z (G_m,) among those of the rig.
+        """Indices of each LiDAR's unknowns z (G_m,) among those of the rig.
 
         The base's come first, those of bow and plate are shared. Tangents of poses follow, see `pose`.
         """
@@ -98,11 +98,11 @@ class RigTerms:
 
     @property
     def size(self) -> int:
-        """Number G of the unknowns that captures share; those of a shape that is the base's are void."""
+        """Number G of the unknowns shared by all captures, with void ones for a shape that is the base's."""
         return sum(part.state.layout.z.size for part in self.parts) + 6 * (len(self.parts) - 1)
 
     def pose(self, m: int) -> Indices:
-        """Places of the tangent (6,) of a LiDAR's pose other than the base."""
+        """Indices of the tangent (6,) of the pose of a LiDAR other than the base."""
         return self.size - 6 * (len(self.parts) - m) + np.arange(6)
 
     def moved(self, z: Array, y: Array) -> "RigTerms":
@@ -119,7 +119,7 @@ class RigTerms:
         return RigTerms(tuple(parts), T)
 
     def weighted(self, trust: Array) -> "RigTerms":
-        """Give the captures other weights (F,)."""
+        """Return a copy with other weights (F,) of the captures."""
         return replace(self, parts=tuple(replace(part, trust=trust) for part in self.parts))
 
 
@@ -170,7 +170,7 @@ class RigEstimate(Optimum):
 
     Attributes:
         terms: linearised there.
-        levels, priors: of each LiDAR; those of the images are the first one's.
+        levels, priors: noise levels and priors of each LiDAR; those of the images are the first one's.
         placement: (F,) number of the placement that each capture shows.
     """
 
@@ -181,18 +181,18 @@ class RigEstimate(Optimum):
 
     @cached_property
     def cost(self) -> Quadratics:
-        """Of the F captures, in z."""
+        """Quadratic cost of the F captures in z."""
         held = [each.held for each in self.priors]
         return replace(assemble_rig(self.terms, self.levels, held).cost, placement=self.placement)
 
     @cached_property
     def left_out(self) -> Array:
-        """Shifts (P, G) of z without each of the placements."""
+        """Shifts (P, G) of z when a placement is left out."""
         return self.cost.moves()
 
     @property
     def profiled(self) -> dict[str, tuple[Indices, float]]:
-        """Places in z and standard deviation of each error of lens and board, by name."""
+        """Index in z and standard deviation of each error of lens and board, by name."""
         return profiled(self.terms.base.state.layout, self.priors[0])
 
     @cached_property
@@ -227,7 +227,7 @@ class RigEstimate(Optimum):
         return perturb(T, J @ self.z), J
 
     def of_model(self, J: Array) -> Array:
-        """Compute the covariance (6, 6) by errors of the model of ring ends, of poses with derivative J."""
+        """Compute the covariance (6, 6) due to errors of the ring end model, for poses with derivative J."""
         moves = [J[:, self._lens(m)] * _LENS_ERROR_M for m in range(len(self.terms.parts))]
         return np.asarray(np.sum([each @ each.T for each in moves], axis=0))
 
@@ -264,12 +264,12 @@ def maximise_rig(
     """Estimate the poses of M LiDARs and of cameras, from estimates of pairs of them.
 
     Args:
-        scans: of each LiDAR, of F captures; the first is the base.
-        images: of each camera, of the same captures.
+        scans: scans of each LiDAR, of F captures; the first is the base.
+        images: images of each camera, of the same captures.
         board: the board.
-        states: of each LiDAR, to start from; the first one's with the cameras' extrinsics.
+        states: states of each LiDAR, to start from; the first one's with the cameras' extrinsics.
         T_lidar_base: (M, 4, 4) to start from.
-        levels, priors: of each LiDAR; the noise is not estimated anew.
+        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated anew.
         placement: (F,) number of the placement that each capture shows.
     """
     once = weigh_placements(placement, images)

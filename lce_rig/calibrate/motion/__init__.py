@@ -1,1 +1,1 @@
-"""Boards that move while captures are taken: their motion, and the channels' time offsets."""
+"""Boards that move during captures: their motion, and the channels' time offsets."""

@@ -1,4 +1,4 @@
-"""The motion of a hand-held board in front of one camera, per capture, from all its images.
+"""Motion of a hand-held board in front of one camera during each capture, from all its images.
 
 Images of one capture, of one channel or several, see the board at different times. Around each scan, its
 velocity is assumed to be constant,
@@ -24,14 +24,14 @@ from lce_rig.core.results import LidarBoard, Observation
 USUAL_HABITS = np.array([0.15, np.radians(10.0)])
 _USUAL_WEIGHT = 3.0
 _N_LEARNING = 15
-# Errors of images beyond their corners' noise: lens, board and reconstruction.
+# Errors of board poses not covered by corner noise: lens, board and reconstruction.
 POSE_FLOOR = np.r_[np.full(3, 1e-3), np.full(3, np.radians(0.1))]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSamples:
-    """Poses of the board in the images of F captures, J of each at most.
+    """Board poses in the images of F captures, at most J per capture.
 
     Attributes:
         channels: names of the channels.
@@ -49,14 +49,14 @@ class PoseSamples:
 
     @property
     def is_followed(self) -> NDArray[np.bool_]:
-        """Whether a sample (F, J) is of a channel that has images of several times in its capture."""
+        """Whether a sample (F, J) is of a channel with images at several times of its capture."""
         known = self.information[..., 0, 0] > 0
         mates = known[:, :, None] & known[:, None] & (self.channel[:, :, None] == self.channel[:, None])
         return np.asarray(np.any(mates & (self.time_s[:, :, None] != self.time_s[:, None]), axis=2))
 
     @property
     def tells_motion(self) -> NDArray[np.bool_]:
-        """Whether a capture (F,) has images of two times, or of two channels whose offset may differ."""
+        """Whether a capture (F,) has images at two times, or of two channels whose offset may differ."""
         known = self.information[..., 0, 0] > 0
         differs = (self.time_s != self.time_s[:, :1]) | (self.channel != self.channel[:, :1])
         return np.asarray(np.any(known & differs, axis=1))
@@ -107,14 +107,14 @@ class BoardMotions:
 
 
 def sample_poses(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:
-    """Collect the poses of the board in the images of scans.
+    """Collect the board poses in the images of each scan.
 
     The images of one channel in one capture, reconstructed from one stream, share much of their error:
     together they count as one.
 
     Args:
         scans: with their images; the first image's corners give the orientation of the others.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
         noise_px: corner noise by channel, replacing each image's own.
     """
     channels = tuple(sorted({channel for scan in scans for channel in scan.images}))
@@ -150,7 +150,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     """Fit equation (1) to each capture, with the typical rates of maximum likelihood.
 
     Args:
-        samples: of F captures.
+        samples: samples of F captures.
         offset_s: (C,) added to the images' times, by channel.
         only: a channel that alone gives the board's position; the others then only give its motion.
 
@@ -161,7 +161,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     time_s = samples.time_s + offset_s[samples.channel]
     base = samples.T_cam_board[:, 0]
     y = difference(samples.T_cam_board, base[:, None])
-    # If a channel was tracked, it alone gives the motion; differences of channels must not count as motion.
+    # A tracked channel alone determines the motion: differences between channels must not count as motion.
     is_followed = samples.is_followed
     is_heard = is_followed | ~np.any(is_followed, axis=1, keepdims=True)
     heard = samples.information * is_heard[..., None, None]
@@ -187,7 +187,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
 def _disagreement(
     samples: PoseSamples, moved: Array, cov: Array, time_s: Array, is_silent: NDArray[np.bool_]
 ) -> Array:
-    """Measure squared residuals (F,) of images under motions that were estimated without them.
+    """Compute the squared residuals (F,) of images under motions estimated without them.
 
     Another camera pose, the same in all captures, does not count: its tangent (tau, phi) moves the
     board at c by tau + phi x c.
@@ -210,7 +210,7 @@ def _disagreement(
 
 
 def _learn_habits(H: Array, g: Array) -> Array:
-    """Find the precision (12, 12) of position and rates that a hand's typical rates give a priori.
+    """Estimate the prior precision (12, 12) of position and rates from the hand's typical rates.
 
     Args:
         H, g: (F, 12, 12), (F, 12) normal equations of both, from which the position is eliminated.
@@ -245,7 +245,7 @@ def _place(
 
 
 def board_time_s(lidar: LidarBoard, sweep_s: float) -> float:
-    """Average the firing times of a board's points, s after the scan's timestamp; mid scan where unknown."""
+    """Average the firing times of a board's points, s after the scan's timestamp; mid-scan if unknown."""
     return sweep_s / 2 if lidar.offset_ns is None else float(np.mean(lidar.offset_ns)) * 1e-9
 
 
@@ -255,10 +255,10 @@ def compensate(
     """Bring both sensors' boards to the LiDAR's time, and the points of each board to one time.
 
     Args:
-        observations: of F captures.
-        motions: of the board in them.
+        observations: observations of F captures.
+        motions: motions of the board in them.
         T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
-        sweep_s: of the LiDAR.
+        sweep_s: duration of a revolution of the LiDAR.
     """
     times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
     moved = [

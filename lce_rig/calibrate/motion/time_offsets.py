@@ -1,4 +1,4 @@
-"""Time offsets of each channel's images, from boards that moved.
+"""Time offsets of each channel's images, estimated from moving boards.
 
 The cost of Algorithm 1 is a function of the channels' time offsets o: each o gives every capture another pose
 of the board at the time the LiDAR saw it (`board_motion`), and the extrinsics are solved again,
@@ -41,21 +41,21 @@ MIN_MOVING = 6
 """Fewer captures with images of several times do not determine time offsets."""
 # Ratio of mean squared rates to noise above which boards moved.
 _MOVED = 1.0
-# Time offsets a priori where a profile states no tolerance; and where timestamps are missing: such images may
-# be at any time around the scan they were saved with.
+# Prior standard deviations of time offsets, s: without a tolerance in the profile; and without timestamps,
+# when an image may be from any time around its scan.
 _TOLERANCE_S, _NO_STAMPS_SIGMA_S = 0.05, 0.15
 _REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = 0.004
 _N_ITERATIONS = 6
 _CONVERGED_S = 5e-4
-# A capture's squared term of this size has half weight; it has three to six degrees of freedom.
+# Squared term of a capture at which its weight is halved; it has three to six degrees of freedom.
 _ROBUST = 12.0
 _FREEDOMS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The boards of F scans, and how they moved between the scan and its images.
+    """The boards of F scans, and their motion between the scan and its images.
 
     Attributes:
         scans: with their images.
@@ -78,7 +78,7 @@ class Motion:
 
     @property
     def is_seen_by_each(self) -> bool:
-        """Whether boards stood still, or a channel alone shows their motion: channels can be compared."""
+        """Whether channels can be compared: boards stood still, or one channel alone shows their motion."""
         return self.offset_s is None or bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
 
     def observations(self, only: str | None = None) -> list[Observation]:
@@ -103,9 +103,9 @@ def estimate_motion(
     Args:
         scans: F of them with their images.
         samples: poses of the board in these.
-        board: its size.
+        board: the board's size.
         start: extrinsics and weights without compensation.
-        clocks: of the sensors.
+        clocks: clock settings of the sensors.
     """
     still = Motion(scans, samples, start.T_cam_lidar, clocks.sweep_s)
     moving = np.flatnonzero(samples.tells_motion).tolist()
@@ -133,7 +133,7 @@ def estimate_motion(
     inverse = symmetric_inverse(hessian + cost.precision)
     few = len(observations) / max(len(observations) - len(offset_s) - 6, 1)
     cov = inverse @ (few * gradients.T @ gradients + cost.precision) @ inverse
-    # Uninformative captures scatter little: the variance must not be below that from the curvature of (1).
+    # Uninformative captures scatter little, so the variance is at least that from the curvature of (1).
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
     if fit_motions(samples, offset_s).significance <= _MOVED:
         return still
@@ -142,7 +142,7 @@ def estimate_motion(
 
 @dataclass(frozen=True, eq=False)
 class _Cost:
-    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' timestamps."""
+    """Equation (1) for F captures with boards seen by the LiDAR at times (F,) after the scan's timestamp."""
 
     samples: PoseSamples
     features: Sequence[CaptureFeatures]
@@ -151,7 +151,7 @@ class _Cost:
     precision: Array
 
     def at(self, offset_s: Array, T_start: Array) -> "_Evaluation":
-        """Solve for the extrinsics at offsets (C,), from T_cam_lidar (4, 4) nearby."""
+        """Solve for the extrinsics at offsets (C,), starting from a nearby T_cam_lidar (4, 4)."""
         motions = fit_motions(self.samples, offset_s)
         poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
         problem = Problem([replace(f, T_cam_board=T, cov=cov) for f, T, cov in poses], self.weights)
@@ -229,7 +229,7 @@ def _rho(squared: Array) -> Array:
 def _search_grid(
     samples: PoseSamples, observations: Sequence[Observation], T: Array, prior_sigma_s: Array, times_s: Array
 ) -> Array:
-    """Find the offsets (C,) with the boards' middles closest to the camera's planes, on a coarse grid."""
+    """Search a grid for the offsets (C,) that bring the boards' centres closest to the camera's planes."""
     middles = np.array([observation.lidar.points.mean(axis=0) for observation in observations])
     ticks = np.arange(-_REACH_S, _REACH_S + _GRID_S / 2, _GRID_S)
     best, best_cost = np.zeros(len(samples.channels)), np.inf
@@ -238,7 +238,7 @@ def _search_grid(
         motions = fit_motions(samples, offset_s)
         T_cam_board = motions.at(times_s)
         depth = np.sum((T_cam_board[:, :3, 3] - transform(T, middles)) * T_cam_board[:, :3, 2], axis=1)
-        # The extrinsics adapt: their six small motions are projected out of the residuals.
+        # The extrinsics adapt, so project their six small motions out of the residuals.
         J = differentiate(T_cam_board[:, :3, 2], middles @ T[:3, :3].T)
         misfit = np.abs(depth - J @ np.linalg.lstsq(J, depth, rcond=None)[0])
         cost = 2 * len(misfit) * np.log(np.median(misfit) + 1e-3)

@@ -1,4 +1,4 @@
-"""Information of a board placement on the extrinsics, before its capture; placements add up.
+"""Predicted information of a board placement on the extrinsics; placements add up.
 
 A placement becomes the returns, the ring ends and the image's pose that both sensors would measure there. The
 likelihood's own rows (`calibrate.likelihood.model`) give its information H_k on the extrinsics and on the
@@ -29,10 +29,10 @@ from lce_rig.collect.guidance.sensor_model import SensorModel
 from lce_rig.core.geometry import Array, invert, pose, skew
 from lce_rig.core.results import BoardPose
 
-# The detector does not use shorter rings as lines.
+# Minimum number of points of a ring: the detector does not fit lines to shorter ones.
 FEWEST_POINTS = 6
 _SAMPLES = 48
-# Positions of a ring's two representative returns, fractions of its chord: exact for second moments.
+# Positions of the two returns that represent a ring, fractions of its chord: exact for second moments.
 _NODES = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12)
 # Noise of a corner per coordinate, px: typical of recordings.
 _CORNER_PX = 0.05
@@ -40,12 +40,12 @@ _CORNER_PX = 0.05
 _PRIOR_SIGMAS = np.repeat([1.0, 0.5], 3)
 # Unknowns of a leave-one-out covariance: the extrinsics and the edge shift.
 _N_UNKNOWNS = 7
-# Unknowns that captures determine or that matter, without held ones; the pattern is added last.
+# Unknowns that captures determine or that affect the result, without fixed ones; the pattern is added last.
 _UNKNOWNS = ("camera 0", *LASER, "lens", "bow", "shifts", "squares")
 _N_PATTERN = BOARD["pattern"]
 # Maximum number of groups of lasers.
 _MOST_GROUPS = 16
-# Placements weighed at once, to limit memory.
+# Placements evaluated at once, to limit memory.
 _CHUNK = 200
 
 
@@ -85,7 +85,7 @@ def cross_board(model: SensorModel, T_lidar_board: Array) -> Rings:
     board, axes, centre = model.board, T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3]
     azimuth, span = _azimuths(model, T_lidar_board)
     level, rise = np.cos(model.elevations_rad), np.sin(model.elevations_rad)
-    # Dot products of each ray with the three axes of each board, (N, 3, L, K).
+    # Dot products of each ray with each board's three axes, (N, 3, L, K).
     around = np.cos(azimuth)[:, None] * axes[:, 0, :, None] + np.sin(azimuth)[:, None] * axes[:, 1, :, None]
     along = level[:, None] * around[:, :, None, :] + (rise[:, None] * axes[:, 2, :, None, None])
     to_centre = np.einsum("nji,nj->ni", axes, centre)
@@ -102,7 +102,7 @@ def cross_board(model: SensorModel, T_lidar_board: Array) -> Rings:
     n_points = np.where(n_points >= FEWEST_POINTS, n_points, 0.0)
     outer = np.stack([first, last], axis=-1)
     ends = np.take_along_axis(xy, outer[:, None], axis=-1).transpose(0, 2, 3, 1)
-    # A sample covers half a sample to either side.
+    # A sample covers half a sample spacing to either side.
     chord = ends[:, :, 1] - ends[:, :, 0]
     beyond = chord / np.maximum(n_hit - 1, 1)[..., None] / 2
     ends = np.stack([ends[:, :, 0] - beyond, ends[:, :, 1] + beyond], axis=2)
@@ -143,7 +143,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """Predicted covariances of the extrinsics, tangent (translation m, rotation rad), axes of the camera.
+    """Predicted covariances of the extrinsics, tangent (translation m, rotation rad), camera axes.
 
     Attributes:
         cov: (..., 6, 6) that the calibration will state.
@@ -155,7 +155,7 @@ class Precision:
 
 
 class Predictor:
-    """Weighs placements by the likelihood's rows.
+    """Weights placements by the likelihood's rows.
 
     Args:
         model: the sensors.
@@ -173,7 +173,7 @@ class Predictor:
             priors.held, azimuth_rad=share * priors.azimuth_rad, elevation_rad=share * priors.elevation_rad
         )
         self._levels = replace(levels, ring_m=share * levels.ring_m, laser_m=share * levels.laser_m)
-        # Priors and derivatives are those of any board.
+        # Priors and derivatives do not depend on the board's pose, so take any.
         ahead = _straight_ahead(model)[None]
         terms = self._linearise(T_cam_lidar @ ahead, cross_board(model, ahead))
         kept = terms.state.layout.z.of(_UNKNOWNS)
@@ -196,12 +196,12 @@ class Predictor:
         return Evidence(hessians, rings.n_rings, rings.n_points.sum(axis=1))
 
     def combine(self, held: Evidence, more: Evidence | None = None, weight: float = 1.0) -> Precision:
-        """Predict (6, 6) from all placements together, equation (1).
+        """Predict the covariance of the extrinsics (6, 6) from all placements together, equation (1).
 
         Args:
-            held: the placements.
-            more: N further placements: each in turn beside those held gives (N, 6, 6).
-            weight: number of captures of each placement held.
+            held: the placements captured so far.
+            more: N candidate placements, each added alone to `held`; the result is (N, 6, 6).
+            weight: number of captures per placement in `held`.
         """
         data = weight * held.hessians.sum(axis=0)
         if more is None:
@@ -272,7 +272,7 @@ class Predictor:
 
 
 def _straight_ahead(model: SensorModel) -> Array:
-    """Place a board 2 m before the LiDAR's middle laser, facing it: T_lidar_board (4, 4)."""
+    """Return T_lidar_board (4, 4) of a board that faces the LiDAR 2 m ahead, at its median elevation."""
     angle = float(np.median(model.elevations_rad))
     normal = np.array([-np.cos(angle), 0.0, -np.sin(angle)])
     right = np.array([0.0, -1.0, 0.0])
@@ -291,10 +291,10 @@ def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
 def few_captures_factor(n_captures: int) -> float:
     """Return the small-sample inflation factor of the covariance.
 
-    It is the correction of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
-    `_N_UNKNOWNS` + 2 captures; below one more it grows with the inverse of their number. Few captures show
-    neither their noise nor outliers: results of 6 to 8 captures of a recording (rlfs02) were .2 deg from that
-    of all 27, two to three of their standard deviations; of 10 captures .1 deg.
+    It is the factor of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
+    `_N_UNKNOWNS` + 2 captures. With fewer than `_N_UNKNOWNS` + 3 it is extrapolated as 1/n. Few captures
+    reveal neither noise nor outliers: with 6 to 8 captures of rlfs02, results differed from that of all 27
+    by 0.2 deg, 2 to 3 standard deviations; with 10 captures by 0.1 deg.
     """
     fewest = _N_UNKNOWNS + 3
     if n_captures < fewest:
@@ -313,7 +313,7 @@ def sigmas(cov: Array) -> tuple[Array, Array]:
 
 
 def shortfall(model: SensorModel, cov: Array) -> Array:
-    """Compare covariances (..., 6, 6) with the profile's target, (...).
+    """Return the ratio of covariances (..., 6, 6) to the profile's target, (...).
 
     It is the root of the summed squares of the standard deviations of rotation and translation, each in units
     of its target. The larger one dominates; of two placements that reduce it equally, the one that also

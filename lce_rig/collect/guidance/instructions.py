@@ -1,4 +1,4 @@
-"""Instructions that lead the person behind the board from its present pose to the wanted one.
+"""Instructions that guide the person with the board from its present pose to the target pose.
 
 The person faces the rig: the right side of the camera's view is on the person's left.
 """
@@ -16,15 +16,15 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 _STEP_M = 0.6  # Length of a person's step to the side.
 _ROTATIONS = ("tilt", "turn", "roll")
-#: Differences, m and deg, below which no instruction is given: people cannot follow smaller ones.
+#: Differences, m and deg, below which no instruction is given: people cannot correct smaller ones.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
-#: Tolerance of every figure of a board at its wanted pose, in dead bands.
+#: Tolerance of every pose figure at the target, in dead bands.
 THERE = 1.5
 
 
 @dataclass(frozen=True)
 class HeldPose:
-    """Pose of a board in the terms of the person holding it.
+    """Pose of a board as seen by the person holding it.
 
     Attributes:
         right_m: offset of its centre to the right of the camera's sight line, level.
@@ -50,7 +50,7 @@ def describe_pose(view: SensorPlace, T_cam_board: Array) -> HeldPose:
     ray = centre / np.linalg.norm(centre)
     R = facing_axes(view, ray[None])[0].T @ T_cam_board[:3, :3]
     normal = R[:, 2]
-    # Once the normal is turned level by the shortest way, the rest of the rotation is the roll.
+    # Rotate the normal to horizontal by the shortest way; the remaining rotation is the roll.
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, normal[2])
@@ -83,7 +83,7 @@ def build_pose(view: SensorPlace, held: HeldPose) -> Array:
 
 
 def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str]:
-    """List the moves to make, those of place before rotations, the largest first; empty at the wanted pose.
+    """List the moves to the target pose, translations first, then by size; empty at the target.
 
     Args:
         view: the sensors.
@@ -100,12 +100,12 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str
 
 
 def say(instructions: Mapping[Kind, str]) -> str:
-    """Return the first instruction, as people follow one at a time; "hold still" without any."""
+    """Return the first instruction, since people follow one at a time; "hold still" if there are none."""
     return next(iter(instructions.values()), "hold still")
 
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
-    """Check whether a board (4, 4) is as near to its wanted pose (4, 4) as people can hold it."""
+    """Check whether a board (4, 4) is as close to its target pose (4, 4) as people can hold it."""
     changes = _changes(view, present, wanted)
     return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
 
@@ -117,9 +117,9 @@ def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, flo
     towards the rig, and clockwise as the person sees it.
     """
     now, then = describe_pose(view, present), describe_pose(view, wanted)
-    # A pattern looks the same from either end.
+    # A pattern looks the same upside down.
     roll_deg = (then.roll_deg - now.roll_deg + 90) % 180 - 90
-    # Forwards is towards the rig from where the person stands.
+    # Forwards is towards the rig, as seen by the person.
     sight = np.array([now.right_m, now.ahead_m]) / max(np.hypot(now.right_m, now.ahead_m), 1e-9)
     way = np.array([then.right_m - now.right_m, then.ahead_m - now.ahead_m])
     return {
@@ -155,7 +155,7 @@ def _angle(size_deg: float) -> str:
 
 
 def _level_axes(view: SensorPlace) -> tuple[Array, Array]:
-    """Build the level directions to the camera's right and ahead of it, frame camera."""
+    """Build the horizontal directions to the camera's right and ahead of it, frame camera."""
     right = np.cross(np.array([0.0, 0.0, 1.0]), view.up)
     right /= max(float(np.linalg.norm(right)), 1e-9)
     return right, np.asarray(np.cross(view.up, right))

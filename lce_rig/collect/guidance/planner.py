@@ -1,4 +1,4 @@
-"""The placements that shrink the predicted covariance most: the next one, and those that a session lacks."""
+"""Placements that reduce the predicted covariance most: the next one, and the ones a session lacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 
-#: Span of the captures that fills a bar, as a share of the reachable placements' span.
+#: Span of the captures that fills a bar, as a fraction of the reachable placements' span.
 FULL_SHARE = 0.7
-#: Least angle of a board that is described as leaning to a side.
+#: Minimum angle at which a board is described as tilted to a side, deg.
 LEANS_DEG = 15.0
-#: Range of the boards' rolls that fills the bar.
+#: Range of the boards' rolls that fills the bar, deg.
 FULL_ROLL_DEG = 20.0
 
 
@@ -32,10 +32,10 @@ class Coverage:
     """Five bars, each 0..1.
 
     Attributes:
-        left_right, up_down: how far apart in the image boards were.
-        near_far: how much farther the farthest was than the nearest.
+        left_right, up_down: spread of the boards' positions in the image.
+        near_far: ratio of the largest to the smallest distance.
         tilt: a quarter for each of top, bottom, left and right that was towards the rig by `LEANS_DEG`.
-        roll: how differently boards were turned in their plane.
+        roll: range of the boards' rotations in their plane.
     """
 
     left_right: float
@@ -61,7 +61,7 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
     poses = [describe_pose(view, T_cam_board) for T_cam_board in held]
     lean = np.array([[pose.tilt_deg, pose.turn_deg] for pose in poses])
     leanings = np.concatenate([lean.max(axis=0) > LEANS_DEG, lean.min(axis=0) < -LEANS_DEG])
-    # A pattern looks the same from either end.
+    # A pattern looks the same upside down.
     roll = np.array([(pose.roll_deg - DIAMOND_DEG + 90) % 180 - 90 for pose in poses])
     return Coverage(
         left_right=float(left_right),
@@ -73,30 +73,30 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
 
 
 def _places(view: SensorPlace, T_cam_board: Array) -> Array:
-    """Return the board centres' position in the image, px, and the logarithm of their distance, (N, 3)."""
+    """Return the board centres' position in the image, px, and the log of their distance, (N, 3)."""
     centre = T_cam_board[:, :3, 3]
     pixels, _ = view.model.lens.project(centre)
-    # A centre out of sight counts as one at the image's middle.
+    # A centre outside the image counts as one in its middle.
     middle = [view.model.lens.cx_px, view.model.lens.cy_px]
     pixels = np.where(np.isfinite(pixels), pixels, middle)
     return np.column_stack([pixels, np.log(np.linalg.norm(centre, axis=1))])
 
 
-#: The target counts as met when the calibration is predicted to state this share of it.
+#: Fraction of the target at which the predicted standard deviation counts as sufficient.
 ENOUGH_SHARE = 0.9
-#: Least gain of a new placement, as a share of the best placement's gain; below it, it adds nothing.
+#: Minimum gain of a new placement, as a fraction of the best placement's gain; a smaller gain adds nothing.
 LEAST_SHARE = 0.1
-#: Least gain of the best placement; below it, any new placement is accepted.
+#: Gain of the best placement below which any new placement is accepted.
 LEAST_GAIN = 0.02
 #: Radius around an unreachable placement.
 AVOIDED_M = 0.4
-# Relative increase of the cost per metre of way, and per radian of turn.
+# Relative increase of the cost per metre of walking and per radian of rotation.
 _EFFORT = 0.01
 # Upper bound of the "captures left" shown to the user.
 _MOST_MORE = 60
-# Number of captures of each reachable placement in the limit of many.
+# Number of captures per reachable placement that approximates infinitely many.
 _MANY = 1e4
-# Number of placements, the best for one pair of sensors, that are weighed for others, too.
+# Number of best placements for one pair of sensors that are also evaluated for other pairs.
 _BEST = 40
 
 
@@ -126,10 +126,10 @@ class Guidance(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """Another pair of sensors that may see the same board.
+    """Another pair of sensors that may detect the same board.
 
     Attributes:
-        planner: of it.
+        planner: planner of this pair.
         T_other_cam: (4, 4) from the camera's frame to that of its camera.
         held: (N, 4, 4) T_cam_board of its captures, frame of its camera.
     """
@@ -140,7 +140,7 @@ class Beside(NamedTuple):
 
 
 class Planner:
-    """Chooses placements of the board before one camera and one LiDAR.
+    """Chooses placements of the board in front of one camera and one LiDAR.
 
     Args:
         view: the sensors, and the extrinsics as far as known.
@@ -160,12 +160,12 @@ class Planner:
         poses = spread_candidates(view, n_places)
         self._predictor = Predictor(view.model, view.T_cam_lidar)
         evidence = self._predictor.weigh(poses)
-        # One ring more than needed, as people do not hold the board to the centimetre.
+        # Require one ring more than the minimum, as people do not hold the board to the centimetre.
         is_seen = (evidence.n_rings > view.model.limits.min_rings) & (
             evidence.n_points >= view.model.limits.min_points
         )
         self.candidates, self._evidence = poses[is_seen], evidence.of(is_seen)
-        # Covariance that no placements can shrink; unknown without placements.
+        # Covariance that further placements cannot reduce; unknown without placements.
         limit = self._predictor.combine(self._evidence, weight=_MANY).without_pattern
         self._limit = limit if len(self.candidates) else np.zeros_like(limit)
 
@@ -192,7 +192,7 @@ class Planner:
         after = self._predictor.combine(evidence, self._evidence).without_pattern - self._limit
         cost = shortfall(model, after)
         if present is not None:
-            # Add the way in m and the turn in rad.
+            # Add the distance in m and the rotation in rad.
             way_m = np.linalg.norm(self.candidates[:, :3, 3] - present[:3, 3], axis=1)
             turn = np.arccos(np.clip(self.candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
             cost = cost * (1 + _EFFORT * np.asarray(way_m + turn))
@@ -230,7 +230,7 @@ class Planner:
         )
 
     def shortfall_after(self, held: Array, placements: Array) -> Array:
-        """Predict the shortfall from the target after each one of further placements, seen or not.
+        """Predict the remaining ratio to the target after each further placement, detected or not.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
@@ -262,7 +262,7 @@ class Planner:
         avoid: Array | None = None,
         asked: Array | None = None,
     ) -> Refusal | None:
-        """Refuse a placement that would hardly shrink the predicted covariance.
+        """Refuse a placement that would hardly reduce the predicted covariance.
 
         Once the target is predicted to be met, or the best gain is small, only a placement that was captured
         before is refused: a user still collecting wants more captures.
@@ -270,7 +270,7 @@ class Planner:
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
             present: (4, 4) T_cam_board now.
-            names: of the captures held; numbers from 1 by default.
+            names: names of the captures so far; numbers from 1 by default.
             avoid: (M, 4, 4) as `guide` takes them: no board is refused for a better place out of reach.
             asked: (4, 4) placement given to the user; a board there is refused only if captured before.
 
@@ -288,7 +288,7 @@ class Planner:
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
-        # Compute by which share the present and the wanted placement shrink the improvable covariance.
+        # Compute by which fraction the present and the target placement reduce the improvable covariance.
         placements = np.stack([present, wanted])
         model, evidence = self.view.model, self._predictor.weigh(held)
         now = self._predictor.combine(evidence).without_pattern
@@ -304,7 +304,7 @@ class Planner:
     def _count_more(
         self, cov: Array, improvable: Array, then: Array | None, n_captures: int, n_least: int
     ) -> int | None:
-        """Estimate how many more captures are needed, if each adds as much information as the next one.
+        """Estimate how many more captures are needed if each adds as much information as the next one.
 
         Args:
             cov: (6, 6) predicted now.
@@ -315,7 +315,7 @@ class Planner:
         """
         model = self.view.model
         targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))
-        # Errors common to all captures do not shrink.
+        # Errors common to all captures do not decrease.
         constant = np.square(sigmas(cov - improvable))
         before, after = (
             1 / np.maximum(np.square(sigmas(s)), 1e-18)
@@ -328,7 +328,7 @@ class Planner:
         return None
 
     def _choose(self, cost: Array, held: Array, present: Array | None) -> int | None:
-        """Choose the candidate of the least finite cost that is new; None if no such candidate exists."""
+        """Choose the new candidate of lowest finite cost; None if there is none."""
         is_taken = self._is_like(held, self.candidates).any(axis=0)
         new = np.flatnonzero(~is_taken & np.isfinite(cost))
         if not len(new):
@@ -336,17 +336,17 @@ class Planner:
         ranked = new[np.argsort(cost[new], kind="stable")]
         if present is None or not self._is_like(held, present[None]).any():
             return int(ranked[0])
-        # Move the board away from a captured placement, not to one whose instruction is "hold still".
+        # Move the board away from captured placements, not to one with the instruction "hold still".
         away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
         return int(next(away, ranked[0]))
 
     def _is_like(self, held: Array, others: Array) -> NDArray[np.bool_]:
-        """Check which of the other poses (M, 4, 4) match which of the poses held (N, 4, 4), (N, M)."""
+        """Check which of the other poses (M, 4, 4) match which of the captured poses (N, 4, 4): (N, M)."""
         return find_alike(held, others, self._min_move_m, self._min_turn_rad)
 
 
 _FEWEST, _MOST = 2, 6
-# Least ratio of distances of boards that are described as near and far ones.
+# Minimum ratio of distances at which boards are described as near and far.
 _FAR = 1.4
 # Default T_cam_lidar: a LiDAR beside the camera, facing the same way; accurate enough to place a board.
 _SAME_WAY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -355,7 +355,7 @@ _SAME_WAY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]
 def plan_captures(
     rig: Rig, camera: str, lidar: str, held: Array, calibration: Calibration | None = None
 ) -> list[Finding]:
-    """Plan the captures to add, each where it reduces the uncertainty most after those before it.
+    """Plan the captures to add: each reduces the uncertainty most, given the ones before it.
 
     The plan ends when the predicted standard deviations, scaled to those of the calibration, meet the
     profile's target.
@@ -429,12 +429,12 @@ def common_third(lens: Intrinsics, centres: Array) -> str:
     """Name the outer third of the image that contains all boards; "" for none.
 
     Args:
-        lens: of the camera.
+        lens: intrinsics of the camera.
         centres: (N, 3) of the boards, camera frame, m.
     """
     pixels, _ = lens.project(centres)
     x, y = (pixels / [lens.width_px, lens.height_px]).T
-    # The person faces the rig: the image's right is on the left.
+    # The person faces the rig, so the image's right is on the person's left.
     for word, share in (("high", y), ("low", 1 - y), ("on your right", x), ("on your left", 1 - x)):
         if share.max() < 1 / 3:
             return word

@@ -1,4 +1,4 @@
-"""The sensors' models for guidance: their accuracy for a board, and the placements within reach."""
+"""Sensor models for guidance: their accuracy for a board, and the reachable placements."""
 
 from dataclasses import dataclass, field, replace
 
@@ -81,7 +81,7 @@ class SensorModel:
 
 
 def _as_measured(priors: Priors, levels: Levels, known: KnownLidar) -> tuple[Priors, Levels]:
-    """Replace priors of a LiDAR's errors by the mean deviations of those that were measured before."""
+    """Replace the priors of a LiDAR's errors by the rms of errors measured earlier."""
     range_m, azimuth_rad, elevation_rad = np.sqrt(np.mean(known.lasers_sigma**2, axis=1)).tolist()
     lateral_m, vertical_m = known.lens_sigma.tolist()
     measured = replace(
@@ -95,22 +95,24 @@ def _as_measured(priors: Priors, levels: Levels, known: KnownLidar) -> tuple[Pri
     return measured, replace(levels, laser_m=range_m)
 
 
-#: Least planned distance of the board from the camera, m: nearer, it exceeds the image or the LiDAR's field.
+#: Minimum planned distance of the board from the camera, m: closer, it exceeds the image or the LiDAR's field
+#: of view.
 NEAREST_M = 1.2
 #: Tilts of planned placements, deg: none, and two rings of directions; steeper ones shorten the squares.
 TILTS_DEG = (0.0, 22.0, 42.0)
 N_TILT_DIRECTIONS = 8
 _N_TILTS = 8
-#: As a diamond each ring crosses two slanted edges.
+#: Rotation as a diamond, deg: each ring then crosses two slanted edges.
 DIAMOND_DEG = 45.0
 ROLLS_DEG = (-12.0, 0.0, 12.0)
-#: Share of the plate's height that must lie within the LiDAR's vertical field.
+#: Fraction of the plate's height that must lie within the LiDAR's vertical field of view.
 SEEN_SHARE = 0.8
-# Scale of the plate that must lie within the field of view of a LiDAR without rings: a cut plate is refused.
+# Scale of the plate that must lie within the field of view of a LiDAR without rings: a truncated plate is
+# refused.
 _FREE_SHARE = 1.2
-#: Lowest and highest position of the board's centre relative to the LiDAR, m: the reach of arms.
+#: Lowest and highest position of the board's centre relative to the LiDAR, m: the reach of a person's arms.
 REACH_M = (-0.9, 0.8)
-# Free border of the image, as a share of its width: people do not hold the board to the pixel.
+# Free border of the image, as a fraction of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
 _GRAZING_COSINE = 0.45
 # Powers of 1/g with g^4 = g + 1 fill three dimensions evenly (M. Roberts, 2018).
@@ -131,12 +133,12 @@ class SensorPlace:
 
     @property
     def up(self) -> Array:
-        """The unit vector upwards (3,), frame camera: the z axis of the LiDAR, which stands upright."""
+        """Unit vector upwards (3,), frame camera: the z axis of the LiDAR, assumed upright."""
         return np.asarray(self.T_cam_lidar[:3, 2])
 
     @classmethod
     def nominal(cls, rig: Rig, camera: str, lidar: str) -> "SensorPlace":
-        """Take the profile's nominal extrinsics.
+        """Place the camera by the profile's nominal extrinsics.
 
         Raises:
             ProfileError: it has none, or the beams of the LiDAR's model are not known.
@@ -151,7 +153,7 @@ class SensorPlace:
 
 
 def spread_candidates(view: SensorPlace, n_places: int) -> Array:
-    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over the reachable space.
+    """Generate poses T_cam_board (N, 4, 4) visible to both sensors, evenly over the reachable space.
 
     Args:
         view: the sensors.
@@ -162,14 +164,14 @@ def spread_candidates(view: SensorPlace, n_places: int) -> Array:
     pixels = (0.1 + 0.8 * even[:, :2]) * [lens.width_px - 1, lens.height_px - 1]
     rays = lens.unproject(pixels)
     far_m = view.model.limits.max_distance_m
-    # Equal steps in 1/distance: near boards differ more from one another.
+    # Equal steps in 1/distance: nearby boards differ more from one another.
     distance_m = 1 / (1 / NEAREST_M + (1 / far_m - 1 / NEAREST_M) * even[:, 2])
     # List all tilts (T, 2) about the level axis and the upward one, rad.
     straight, *tilted = np.radians(TILTS_DEG)
     direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
     circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
     tilts = np.concatenate([[[straight, straight]], *(tilt_rad * circle for tilt_rad in tilted)])
-    # Try some of the tilts at each place, the next ones at the next.
+    # Use some of the tilts at each place and the following ones at the next place.
     which = np.arange(n_places * _N_TILTS)
     tilt = tilts[(which * 5) % len(tilts)]
     roll = np.radians(DIAMOND_DEG + np.array(ROLLS_DEG)[(which // len(tilts)) % len(ROLLS_DEG)])
@@ -198,7 +200,7 @@ def face_camera(view: SensorPlace, rays: Array, distance_m: Array, tilt_rad: Arr
 
 
 def facing_axes(view: SensorPlace, rays: Array) -> Array:
-    """Build the axes (N, 3, 3) of boards that face the camera: level to the right, upwards, towards it."""
+    """Build the axes (N, 3, 3) of boards that face the camera: horizontally right, up, towards the camera."""
     right = np.cross(view.up, -rays)
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
     return np.stack([right, np.cross(-rays, right), -rays], axis=-1)
@@ -229,12 +231,12 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     ok &= np.sum(normal * to_lidar, axis=1) > _GRAZING_COSINE * range_m
     height_m = -to_lidar @ view.up
     ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
-    # People do not hold a board flat.
+    # People do not hold a board horizontally.
     return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
 
 
 def _is_in_lidar_view(view: SensorPlace, outline: Array) -> NDArray[np.bool_]:
-    """Find which outlines (N, K, 3), frame camera, the LiDAR sees: rings most of one, others all of it."""
+    """Find which outlines (N, K, 3), frame camera, the LiDAR sees: by rings mostly, otherwise entirely."""
     model, T_lidar_cam = view.model, invert(view.T_cam_lidar)
     if model.pattern != "rings":
         middle = outline.mean(axis=1, keepdims=True)

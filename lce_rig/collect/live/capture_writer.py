@@ -1,4 +1,4 @@
-"""Write live captures, and raw streams on request, and let the guidance learn from the captures."""
+"""Write live captures, raw streams on request, and update the guidance from the captures."""
 
 import time
 from collections import deque
@@ -29,7 +29,7 @@ _NICE = 10
 
 
 class Learning:
-    """Calibrates the captures of each guide's sensors; open while its `with` block lasts."""
+    """Calibrates each guide's captures in the background; open while its `with` block lasts."""
 
     def __init__(self, rig: Rig, guides: Sequence[Guide]) -> None:
         """Prepare; the process starts once there are enough captures."""
@@ -49,7 +49,7 @@ class Learning:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop, without waiting for a calibration."""
+        """Stop without waiting for a running calibration."""
         self._is_open = False
         self._worker.__exit__(None, None, None)
         self._caller.shutdown(cancel_futures=True)
@@ -69,7 +69,7 @@ class Learning:
                 self._due.append(k)
 
     def teach(self) -> None:
-        """Pass the planner learned since the last call to its guide, and learn from newer captures."""
+        """Pass the planner calibrated since the last call to its guide, and calibrate newer captures."""
         if self._running is not None and self._running[1].done():
             k, learned = self._running
             self._running, planner = None, None
@@ -77,7 +77,7 @@ class Learning:
                 planner = learned.result()
             except Exception as error:  # Captures are safe even if a calibration fails.
                 self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
-            # If captures were added or taken back meanwhile, this guide is due again.
+            # If captures were added or rejected meanwhile, calibrate this guide again.
             if k not in self._due:
                 self._guides[k].adopt(planner)
         if self._running is None and self._due and self._is_open:
@@ -94,12 +94,12 @@ class Learning:
                 guide.adopt(None)
 
     def notes(self) -> list[str]:
-        """Return the problem of the last attempt to learn, if any."""
+        """Return the problem of the last calibration, if any."""
         return [self._problem] if self._problem else []
 
 
 class _Teacher:
-    """The object in the worker's process."""
+    """The calibrating object in the worker process."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig, self._board = rig, rig.board.to_board()
@@ -121,7 +121,7 @@ class _Teacher:
 
 
 class CaptureWriter:
-    """Writes captures one after the other, and takes them back in the same order.
+    """Writes captures one after the other, and rejects them in the same order.
 
     Attributes:
         session: open for writing.
@@ -147,7 +147,7 @@ class CaptureWriter:
 
     @property
     def is_busy(self) -> bool:
-        """Whether the writing or taking back of a capture is pending."""
+        """Whether a capture is still to be written or rejected."""
         return self.disk.n_waiting > 0
 
     def keep(self, moment: CaptureMoment, events: Sequence[EventCut], meta: Mapping[str, object]) -> None:
@@ -170,7 +170,7 @@ class CaptureWriter:
         self.disk.put(store)
 
     def take_back(self, name: str) -> None:
-        """Reject a capture, which may still wait to be written; returns at once."""
+        """Reject a capture, even one that is not written yet; returns at once."""
 
         def reject() -> None:
             self.session.reject(name, "taken back while collecting")
@@ -179,7 +179,7 @@ class CaptureWriter:
         self.disk.put(reject)
 
     def take(self) -> list[tuple[str, BoardDetection | None, float]]:
-        """Return the captures saved or taken back since the last call, by name.
+        """Return the captures saved or rejected since the last call, by name.
 
         Each comes with its detection, None if it was taken back, and the time in s until it was safe.
 

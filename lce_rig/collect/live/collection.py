@@ -39,10 +39,10 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
 
-# Switch interval of threads: sensor threads need the interpreter often and briefly, the loop holds it for
-# long. At Python's 5 ms, guidance would be slower by a third.
+# Switch interval of threads, s: sensor threads need the interpreter often and briefly, the loop holds it for
+# long. Python's 5 ms would slow guidance by a third.
 _TURN_S = 0.0005
-# Largest apparent motion of a board that has not moved.
+# Largest apparent motion of a board at rest.
 _SAME_M, _SAME_DEG = 0.02, 2.0
 
 
@@ -54,12 +54,12 @@ def collect_live(
     keys: Callable[[], Key | TakeBack | None] = lambda: None,
     record_to: Path | None = None,
 ) -> LiveReport:
-    """Collect from attached sensors until the captures are enough.
+    """Collect from attached sensors until there are enough captures.
 
     Args:
         session: open for writing; its captures count.
-        sources: of every sensor, and of the sync board if there is one; not open yet.
-        options: of the collection.
+        sources: live sources of every sensor, and of the sync board if there is one; not open yet.
+        options: options of the collection.
         show: receives the state after every frame, and twice a second without one; must not block.
         keys: returns the user's last key or request, if any.
         record_to: a new folder for the raw streams; None to record none.
@@ -75,7 +75,7 @@ def collect_live(
     guides = make_guides(rig)
     for capture in session.captures:
         count_in(capture, session, guides)
-    # Order of closing: first no new data comes, then the pending captures are written.
+    # Close in this order: stop new data first, then write the pending captures.
     with ExitStack() as stack:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_TURN_S)
@@ -101,12 +101,12 @@ def collect_live(
 
 
 def _time_s(detection: BoardDetection) -> float:
-    """Return the sensors' time in s: patience counts sensor time, however slow this computer is."""
+    """Return the sensors' time in s: timeouts count sensor time, however slow this computer is."""
     return detection.frame.time_ns * 1e-9
 
 
 class _Asked(NamedTuple):
-    """A capture of this run: its name, the time of its detection, and the board's pose by camera."""
+    """A capture requested in this run: its name, detection time, and the board's pose by camera."""
 
     name: str
     time_ns: int
@@ -139,7 +139,7 @@ class _Loop:
         self._last: BoardDetection | None = None
 
     def run(self, show: Callable[[LiveState], None], keys: Callable[[], Key | TakeBack | None]) -> None:
-        """Collect until an ending; losses are noted while the sensors are still open."""
+        """Collect until an end condition; losses are logged while the sensors are still open."""
         while True:
             frame = self._feed.take()
             self.take_kept()
@@ -164,7 +164,7 @@ class _Loop:
                 return
 
     def take_kept(self) -> None:
-        """Count the captures that were saved or taken back, and adopt new planners."""
+        """Count the saved and rejected captures, and adopt new planners."""
         self._learning.teach()
         for name, detection, latency_s in self._keeper.take():
             if detection is None:
@@ -259,7 +259,7 @@ class _Loop:
         statuses = self._sensors.statuses()
         serials = {name: status.serial for name, status in statuses.items() if status.serial}
         meta |= {SERIALS: serials} if serials else {}
-        # A board that stands still makes too few events.
+        # A board at rest gives too few events.
         self._keeper.keep(moment, frame.events if isinstance(gate, SlowBoards) else (), meta)
         name = f"{self._number:06d}"
         self._number += 1
@@ -275,7 +275,7 @@ class _Loop:
 
     @property
     def _n_captures(self) -> int:
-        """Captures in the session that are safe and were not taken back."""
+        """Number of captures in the session that are saved and not rejected."""
         return self._n_before + len(self.report.captured)
 
     def _obey(self, key: Key | TakeBack | None) -> None:
@@ -285,7 +285,7 @@ class _Loop:
                 self._monitor.cue("refused", "nothing to take back: no capture in this run")
             if not last or key.name not in ("", last):
                 return  # A tap that came late, or twice, means no other capture.
-            # The capture may be on the disk yet or not.
+            # The capture may or may not be on the disk yet.
             taken = self._asked.pop()
             self._keeper.take_back(last)
             self.report.captured = [name for name in self.report.captured if name != last]
@@ -301,11 +301,11 @@ class _Loop:
             self._capture_by_hand(self._last)
 
     def _capture_by_hand(self, detection: BoardDetection) -> None:
-        """Capture the board at once, even while it moves, unless it was captured a moment ago."""
+        """Capture the board at once on request, even if it moves, unless it was just captured."""
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        # A keypress just after an automatic capture counts as late.
+        # A keypress just after an automatic capture is treated as late and ignored.
         is_recent = time.monotonic() - self._captured_s < self._options.hold_s
         places = Placements() if is_recent else Placements(_SAME_M, _SAME_DEG)
         if self._asked and places.are_alike(self._asked[-1].poses, detection.poses):
@@ -350,7 +350,7 @@ class _Loop:
         lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
         goes_on = ""
         if lacking and not has_ended:
-            # The guide that needs most captures gives the reason.
+            # Report the reason of the guide that needs most captures.
             most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
             goes_on = (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
         return self._monitor.state(
@@ -362,7 +362,7 @@ class _Loop:
         )
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
-        """Pick the guide to show: among those that see the board, the one that needs captures most.
+        """Pick the guide to show: the one that needs captures most among those with a visible board.
 
         If these all have enough, include the cameras whose guides have not.
         """
@@ -373,11 +373,11 @@ class _Loop:
         return max(seeing or self._guides, key=lambda guide: guide.need)
 
     def _seeing_guide(self, detection: BoardDetection) -> Guide | None:
-        """Pick the judge of a placement: among guides that see it, the one that needs captures most."""
+        """Pick the guide that judges a placement: the neediest of those that detect it."""
         return max((g for g in self._guides if g.sees(detection)), key=lambda g: g.need, default=None)
 
     def _find_gate(self) -> StillBoards | SlowBoards:
-        """Choose the gate: moving boards where events come and clocks are synchronised, else still ones."""
+        """Choose the gate: for moving boards with events and synchronised clocks, else for still boards."""
         has_events = self._last is not None and bool(self._last.frame.events)
         may_move = has_events and not self._clock.verdict().requires_still_boards
         if self._gate is None or may_move != isinstance(self._gate, SlowBoards):

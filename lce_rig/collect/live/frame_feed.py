@@ -15,14 +15,14 @@ from lce_rig.rig import Rig
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.scan_pairing import LIVE_NS, Frame, event_channel, pair_by_time
 
-# Longest wait for a sample or frame, s: keys and the end are noticed no later.
+# Longest wait for a sample or frame, s: the delay until keys and the end are handled.
 _WAIT_S = 0.1
-# Interval at which the rig's clock takes the sync board's models, s: at 20 ppm it drifts by 10 us in it.
+# Interval at which the rig's clock adopts the sync board's models, s: at 20 ppm it drifts by 10 us meanwhile.
 _REFRESH_S = 0.5
 
 
 class FrameFeed:
-    """Reads the sensors, places samples on the rig's clock and pairs them; open while its `with` block lasts.
+    """Reads the sensors, converts timestamps to the rig's clock, pairs samples; open in its `with` block.
 
     Attributes:
         sensors: open.
@@ -75,7 +75,7 @@ class FrameFeed:
         self._thread.join()
 
     def take(self, timeout_s: float = _WAIT_S) -> Frame | None:
-        """Take the newest frame; None if no frame came in time.
+        """Return the newest frame; None if no frame arrived in time.
 
         Raises:
             LceRigError: the feed cannot continue, for example because the profile's network is unusable.
@@ -88,7 +88,7 @@ class FrameFeed:
     def _run(self) -> None:
         try:
             samples = self._samples()
-            # Cameras whose board is visible in images made of their events only.
+            # Cameras that show the board only in images reconstructed from their events.
             cameras = {
                 name
                 for name, camera in self._rig.cameras.items()
@@ -100,14 +100,14 @@ class FrameFeed:
                 samples, self._rig, self.losses, LIVE_NS, are_events_enough=self._are_events_enough
             ):
                 self._frames.put("pairs", [frame], n_slots=1)
-        except BaseException as error:  # The taker of frames learns of bugs as well.
+        except BaseException as error:  # Pass bugs on to the consumer of frames as well.
             self._failure = error
             self._frames.close()
             if not isinstance(error, LceRigError):
                 raise
 
     def _samples(self) -> Iterator[Sample]:
-        """Yield samples on the rig's clock, which follows the sensors and the sync board."""
+        """Yield samples with timestamps of the rig's clock, which follows the sensors and the sync board."""
         board = self._board
         while not self._stop.is_set():
             if time.monotonic() - self._refreshed_s > _REFRESH_S:

@@ -1,4 +1,4 @@
-"""The captures of two sensors, the next placement, and when a board is captured."""
+"""Captures of two sensors, the next placement, and the decision when to capture a board."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,15 +35,15 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 
-#: Time after which another placement is proposed if the board has not reached the wanted one.
+#: Time after which another placement is proposed if the board has not reached the target, s.
 GIVE_UP_S = 30.0
-# Captures of two sensors of one kind that are enough: in simulations, two LiDARs are then calibrated to
-# 0.04 deg and 2 mm, two cameras to 0.04 deg and 8 mm.
+# Sufficient number of captures of two sensors of one kind: in simulations it gives 0.04 deg and 2 mm for two
+# LiDARs, 0.04 deg and 8 mm for two cameras.
 _ENOUGH_OF_PEERS = 12
 
 
 class Guide:
-    """Guides the board before one camera and one LiDAR.
+    """Guides the board in front of one camera and one LiDAR.
 
     Without nominal extrinsics in the profile, guidance starts after a first calibration. It is not available
     for a LiDAR with unknown beams, nor for two sensors of one kind, whose captures are only counted.
@@ -101,19 +101,19 @@ class Guide:
 
     @property
     def is_enough(self) -> bool:
-        """Whether the target is predicted to be met, or two sensors of one kind have captures enough."""
+        """Whether the target is predicted to be met, or a pair of one kind has enough captures."""
         if self.is_of_peers:
             return self.n_held >= self._n_enough
         return self.guidance is not None and self.guidance.is_enough
 
     @property
     def has_enough(self) -> bool:
-        """Whether the captures are enough: as predicted or, without a prediction, by their number."""
+        """Whether there are enough captures: as predicted or, without a prediction, by their number."""
         return self.n_held >= self._min_captures if self._planner is None else self.is_enough
 
     @property
     def need(self) -> float:
-        """Need of more captures: 1 if the target is just met by prediction, larger before."""
+        """Predicted standard deviation relative to the target: more captures are needed above 1."""
         if self.guidance is None:
             return (self._n_enough if self.is_of_peers else self._min_captures) / max(self.n_held, 0.5)
         return max(
@@ -123,7 +123,7 @@ class Guide:
 
     @property
     def why_none(self) -> str:
-        """Reason why guidance is unavailable; "" while it is available."""
+        """Reason why guidance is unavailable; "" if it is available."""
         return self.problem.sentence if self.problem else ""
 
     @property
@@ -133,34 +133,34 @@ class Guide:
 
     @property
     def wanted(self) -> Array | None:
-        """Placement wanted next, T_cam_board (4, 4); None if no reachable placement is new."""
+        """Target placement T_cam_board (4, 4); None if no reachable placement is new."""
         return None if self.guidance is None else self.guidance.T_cam_board
 
     def sees(self, detection: BoardDetection) -> bool:
-        """Check whether both of its sensors see the board in a detection within the profile's limits."""
+        """Check whether both sensors detect the board within the profile's limits."""
         seen = {(lidar, "") for lidar in detection.lidars} | (
             detection.images.keys() - detection.unfit.keys()
         )
         return {self.key, self.second} <= seen
 
     def add(self, name: str, T_cam_board: Array) -> None:
-        """Take a capture into account; the next placement is chosen by `plan`."""
+        """Add a capture; `plan` then chooses the next placement."""
         self._names.append(name)
         self._held.append(T_cam_board)
         self.guidance = self._coverage = None
 
     def remove(self, name: str) -> None:
-        """Forget a capture that was taken back; its placement is new again."""
+        """Remove a capture that was rejected; its placement is new again."""
         left = [k for k in range(len(self._names)) if self._names[k] != name]
         self._names, self._held = [self._names[k] for k in left], [self._held[k] for k in left]
         self.guidance = self._coverage = None
 
     def prepare(self, T_cam_lidar: Array, levels: Levels, inflation: float) -> Planner | None:
-        """Build a planner from a calibration of the captures; takes a second and changes nothing.
+        """Build a planner from a calibration of the captures, without changing the guide; takes a second.
 
         Args:
             T_cam_lidar: (4, 4).
-            levels: of the noise, as estimated.
+            levels: noise levels, as estimated.
             inflation: factor by which the scatter of the captures widened the covariance.
         """
         if self._model is None:
@@ -169,7 +169,7 @@ class Guide:
         return Planner(SensorPlace(learned, T_cam_lidar))
 
     def adopt(self, planner: Planner | None) -> None:
-        """Take a planner from `prepare`; None to go back to the one before any capture."""
+        """Adopt a planner from `prepare`; None returns to the planner before any capture."""
         before = self._planner
         self._planner, self.problem = self._at_first if planner is None else (planner, None)
         if self._planner is not before:
@@ -183,7 +183,7 @@ class Guide:
         is_asked: bool = True,
         others: Sequence["Guide"] = (),
     ) -> None:
-        """Choose the next placement if none is chosen, or if the last was not reached for long.
+        """Choose the next placement if there is none, or if the last one was not reached in time.
 
         Args:
             present: (4, 4) T_cam_board now; None if the board is not seen.
@@ -202,14 +202,14 @@ class Guide:
         beside = [each for other in others if (each := self._beside(other)) is not None]
         guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         if guidance.T_cam_board is None and self._avoid:
-            # Obstacles may be gone: propose unreachable placements again rather than none.
+            # Obstacles may be gone: propose unreachable placements again rather than nothing.
             del self._avoid[:-1]
             guidance = self._planner.guide(self._held_poses(), present, self._avoided(), beside)
         self.guidance = guidance
         self._wanted_since_s = now_s
 
     def _beside(self, other: "Guide") -> Beside | None:
-        """Relate another guide that still needs captures, by the common camera or LiDAR."""
+        """Describe another guide that still needs captures, related by the common camera or LiDAR."""
         if self._planner is None or other._planner is None or other is self or other.is_enough:
             return None
         own, its = self._planner.view.T_cam_lidar, other._planner.view.T_cam_lidar
@@ -220,12 +220,12 @@ class Guide:
         return None
 
     def note_refusal(self, present: Array) -> None:
-        """Ask for another placement if a board (4, 4) was refused at the wanted one."""
+        """Choose another placement if a board (4, 4) was refused at the target."""
         if self.is_there(present):
             self.give_up()
 
     def give_up(self) -> None:
-        """Ask for another placement: this one is out of reach."""
+        """Choose another placement because this one is out of reach."""
         if self.wanted is not None:
             self._avoid.append(self.wanted)
         self.guidance = None
@@ -271,13 +271,13 @@ class Guide:
         )
 
     def instruct(self, present: Array) -> dict[Kind, str]:
-        """Return the moves from a board (4, 4) to the wanted placement."""
+        """Return the moves from a board (4, 4) to the target placement."""
         if self._planner is None or self.wanted is None:
             return {}
         return instruct(self._planner.view, present, self.wanted)
 
     def is_there(self, present: Array) -> bool:
-        """Check whether a board (4, 4) is at its wanted placement."""
+        """Check whether a board (4, 4) is at the target placement."""
         if self._planner is None or self.wanted is None:
             return False
         return is_there(self._planner.view, present, self.wanted)
@@ -302,7 +302,7 @@ class Guide:
 
 
 def count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
-    """Add a capture of a session to the guides."""
+    """Add a session's capture to the guides."""
     try:
         poses, lidars = capture_poses(capture, session), capture.lidars
     except LceRigError:
@@ -326,7 +326,7 @@ def predict(session: Session) -> list[Finding]:
 
 
 def make_guides(rig: Rig) -> list[Guide]:
-    """Make a guide for every camera with every LiDAR: on its frames channel if it has one.
+    """Make a guide for every camera with every LiDAR, on the camera's frames channel if it has one.
 
     In a rig of one kind of sensor, make one for the first with each other.
     """
@@ -338,7 +338,7 @@ def make_guides(rig: Rig) -> list[Guide]:
 
 
 def _channel_of(rig: Rig, sensor: str) -> str:
-    """Name the channel of a camera that shows the board, its frames channel if it has one; "" for a LiDAR."""
+    """Return the channel of a camera that shows the board, preferably frames; "" for a LiDAR."""
     if sensor in rig.lidars:
         return ""
     camera = rig.cameras[sensor]
@@ -352,10 +352,10 @@ _ELSEWHERE = "hold it somewhere else, tilted otherwise"
 
 @dataclass(frozen=True)
 class Narration:
-    """The message for one moment.
+    """The instruction shown to the person with the board.
 
     Attributes:
-        phase, headline, detail, hold_s: as `LiveState`.
+        phase, headline, detail, hold_s: see `LiveState`.
     """
 
     phase: Phase
@@ -365,7 +365,7 @@ class Narration:
 
 
 def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
-    """Explain why the board is not seen.
+    """Explain why the board is not detected.
 
     Args:
         detection: a sensor of the guide does not see the board in it, or not well enough.
@@ -391,7 +391,7 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
 
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
-    """Explain why the board is not captured at its present place, and give the next move."""
+    """Explain why the board is not captured at its present placement, and return the next move."""
     return Narration("refused", _next(guide, present, refusal.advice), f"not here: {refusal.text}")
 
 
@@ -403,7 +403,7 @@ def _next(guide: Guide, present: Array, otherwise: str) -> str:
     return say(instructions) if instructions else otherwise
 
 
-#: Longest time for which a live moment waits for a better one of its place.
+#: Longest wait for a better capture at the same placement, s.
 LIVE_PATIENCE_S = 0.7
 
 
@@ -411,7 +411,7 @@ class StillBoards:
     """Captures boards that stand still for `hold_s`.
 
     Attributes:
-        is_decided: whether the board was captured, or is not to be, before it has moved.
+        is_decided: whether the board has been captured or rejected since it last moved.
     """
 
     def __init__(self, rig: Rig, hold_s: float) -> None:
@@ -424,7 +424,7 @@ class StillBoards:
         self._refusal: Refusal | None = None
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection; a board that is moved too early is not captured."""
+        """Process the next detection; a board that moves too early is not captured."""
         moments = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
             self._is_judged = self.is_decided = False
@@ -450,7 +450,7 @@ class StillBoards:
 
 
 class SlowBoards:
-    """Captures boards that move slowly before an event camera, at placements not yet in `taken`."""
+    """Captures boards moving slowly in front of an event camera, at placements not yet in `taken`."""
 
     def __init__(self, rig: Rig, taken: Placements) -> None:
         self._gate = MotionGate(rig, taken, Losses(), LIVE_PATIENCE_S)

@@ -14,13 +14,13 @@ from lce_rig.core.geometry import Array
 from lce_rig.devices.reading import SourceStatus
 from lce_rig.session import Session
 
-# Longest time without an update of the views, s, and interval at which the sensors' states are read.
+# Longest time without an update of the views, and interval for reading the sensors' states, s.
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
 _ENOUGH = "enough: you may stop"
 _MET, _COUNTED = "the target is predicted to be met", "enough placements"
 _WAIT = "waiting for the sensors"
-# Age at which the last detection is out of date.
+# Age at which the last detection is out of date, s.
 _STALE_S = 2.0
 
 
@@ -55,7 +55,7 @@ class Monitor:
         self._met = _COUNTED if self._is_of_one_kind else _MET
 
     def see(self, detection: BoardDetection) -> None:
-        """Take a detection, and remember why streams do not show the board."""
+        """Store a detection and the reasons why streams do not show the board."""
         self._detection, self._seen_s = detection, time.monotonic()
         for key, why in detection.unseen.items():
             self.reasons[".".join(key)] = why
@@ -68,7 +68,7 @@ class Monitor:
             self.reasons.pop(lidar, None)
 
     def narrate(self, narration: Narration, guide: Guide, present: Array | None) -> None:
-        """Take the narration of the last detection."""
+        """Store the instruction for the last detection."""
         self._narration, self._guide = narration, guide
         # Tick every half second while the board is held.
         ticks_left = None if narration.hold_s is None else int(narration.hold_s / 0.5)
@@ -91,25 +91,25 @@ class Monitor:
             )
 
     def cue(self, sound: Sound, text: str = "") -> None:
-        """Ask for a sound, and log a message."""
+        """Request a sound, and log a message."""
         self._n_cues += 1
         self._cues.append(Cue(self._n_cues, sound))
         if text:
             self.log(text)
 
     def log(self, text: str) -> None:
-        """Log a message, with the time since the beginning."""
+        """Log a message with the time since the start."""
         elapsed_s = int(time.monotonic() - self._began_s)
         self._n_logged += 1
         self._log.append(f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d} {text}")
 
     def last_words(self) -> str:
-        """Return the last narration, for a report."""
+        """Return the last instruction, for a report."""
         said = self._narration
         return f"last said: {said.headline}" + (f" ({said.detail})" if said.detail else "")
 
     def is_due(self) -> bool:
-        """Check whether views have not been updated for long."""
+        """Check whether the views are due for an update."""
         return time.monotonic() - self._told_s > _EVERY_S
 
     def state(
@@ -170,7 +170,7 @@ class Monitor:
         return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 
     def _watch_sensors(self) -> None:
-        """Update the states of sensors, and log those that are lost or back."""
+        """Update the states of sensors, and log lost and reconnected ones."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
             self._asked_s = time.monotonic()
             self._statuses = self._sensors.statuses()
@@ -186,7 +186,7 @@ class Monitor:
         return self._detection is not None and time.monotonic() - self._seen_s > _STALE_S
 
     def _streams(self) -> tuple[StreamState, ...]:
-        """List every stream: channels of cameras, LiDARs, then other sources."""
+        """List every stream: the cameras' channels, LiDARs, then other sources."""
         rig, streams = self._session.rig, []
         detection = None if self._is_stale() else self._detection
         images = [] if detection is None else [(i.sensor, i.channel) for i in detection.frame.images]
@@ -199,7 +199,7 @@ class Monitor:
                         None if (name, channel) in detection.unfit else detection.images.get((name, channel))
                     )
                     figures = f"{board.distance_m:.1f} m, {board.reprojection_px:.2f} px" if board else ""
-                # Only its source knows the rates of frames and events of one camera.
+                # Only the source knows the separate rates of a camera's frames and events.
                 usual_hz = status.rate_hz if settings.kind == "frames" else 0.0
                 rate_hz = status.rates_hz.get(settings.kind, usual_hz)
                 streams.append(self._stream(f"{name}.{channel}", status, rate_hz, figures))
@@ -215,7 +215,7 @@ class Monitor:
         return (*streams, *(self._stream(each.sensor, each, each.rate_hz, None) for each in others))
 
     def _stream(self, name: str, status: SourceStatus, rate_hz: float, figures: str | None) -> StreamState:
-        """Describe a stream; figures of its board are "" if it is not seen, None if not searched for."""
+        """Describe a stream; its board figures are "" if not detected, None if not searched for."""
         lost = self._sensors.lost().get(status.sensor)
         reason = "" if lost is None else f"lost: {lost[0].what}"
         if figures == "" and not reason:

@@ -1,4 +1,4 @@
-"""The simulated rig in real time: its sensors as live sources, and a person following the guidance.
+"""The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
 
 The simulation runs in its own process, as real sensors do. While the board is held still, its scene is
 rendered once, and measured again for each image and scan; while it moves, it is rendered every time. If the
@@ -36,7 +36,7 @@ REACTION_S = 0.7
 WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
-# Fractions of the way, tried in turn while an obstacle blocks it.
+# Fractions of the way, tried one after the other if an obstacle blocks it.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
@@ -52,7 +52,7 @@ class SimulatedSource(LiveSource):
         self._failure: SourceError | None = None
 
     def open(self) -> None:
-        """Begin to take samples.
+        """Start taking samples.
 
         Raises:
             SourceError: the simulation has ended.
@@ -62,7 +62,7 @@ class SimulatedSource(LiveSource):
         self._taken = Inbox()
 
     def read(self) -> list[Image | Scan]:
-        """Return the samples that the simulation has sent; see `LiveSource`."""
+        """Return the samples from the simulation; see `LiveSource`."""
         came = self._taken.take(_WAIT_S)
         if came is None and self._failure is not None:
             raise self._failure
@@ -78,7 +78,7 @@ class SimulatedSource(LiveSource):
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, device="simulated")
 
     def put(self, sample: Image | Scan) -> None:
-        """Take a sample of the simulation."""
+        """Queue a sample of the simulation."""
         self._taken.put(self.sensor, [sample], _N_SLOTS)
 
     def fail(self, error: SourceError) -> None:
@@ -88,10 +88,10 @@ class SimulatedSource(LiveSource):
 
 
 class SimulatedRig:
-    """A simulated rig and the person with the board before it; open while its `with` block lasts.
+    """A simulated rig and a person with the board in front of it; open while its `with` block lasts.
 
     Attributes:
-        sources: of its sensors: frames and scans. Events cannot be simulated in real time.
+        sources: live sources of its sensors: frames and scans. Events cannot be simulated in real time.
     """
 
     def __init__(self, rig: Rig, seed: int) -> None:
@@ -99,7 +99,7 @@ class SimulatedRig:
 
         Args:
             rig: the profile.
-            seed: of truth, room, noise and the person.
+            seed: random seed of truth, room, noise and the person.
 
         Raises:
             ProfileError: no camera of the rig has frames, or its LiDAR is not known.
@@ -146,7 +146,7 @@ class SimulatedRig:
         self._reader.join()
 
     def watch(self, state: LiveState) -> None:
-        """Show the person a state of the collection: the wanted placement, and the number of captures."""
+        """Show the person a state of the collection: the target placement and the number of captures."""
         place = state.drawing.wanted if state.drawing is not None else None
         if state.phase in ("holding", "saving") or (self._is_guided and place is None):
             return
@@ -174,7 +174,7 @@ class SimulatedRig:
 
 
 class _Simulation:
-    """The object in the worker's process: takes samples turn by turn, no faster than they come in reality."""
+    """The simulation in the worker process: takes samples in turn, no faster than in real time."""
 
     def __init__(self, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
         self._scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
@@ -188,7 +188,7 @@ class _Simulation:
         self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
 
     def take(self, asked: tuple[str, Array] | Literal["elsewhere"] | None) -> list[Image | Scan]:
-        """Send the person to a camera's T_cam_board (4, 4), or elsewhere; take a sample of each sensor."""
+        """Send the person to a camera's T_cam_board (4, 4), or elsewhere; return a sample of each sensor."""
         time.sleep(max(0.0, self._due_s - time.monotonic()))
         if asked == "elsewhere":
             self._walker.set_out(self._walker.choose(), self._stamp_ns * 1e-9)
@@ -197,7 +197,7 @@ class _Simulation:
         self._walker.walk(self._stamp_ns * 1e-9)
         samples = list(self._scene.take(self._stamp_ns))
         self._stamp_ns += self._period_ns
-        # The delay of a slow turn is not made up for by shorter ones.
+        # Do not compensate the delay of a slow turn by shorter ones.
         self._due_s = max(self._due_s + self._period_ns * 1e-9, time.monotonic())
         return samples
 
@@ -227,7 +227,7 @@ class Person:
     ignored_share: float = 0.2
 
     def follow(self, view: SensorPlace, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
-        """Move a board T_cam_board (4, 4) to the wanted pose (4, 4), with the person's errors."""
+        """Move a board T_cam_board (4, 4) to the target pose (4, 4), with the person's errors."""
         aim = describe_pose(view, wanted)
         instructions = instruct(view, present, wanted)
         if instructions and rng.random() < self.ignored_share:
@@ -240,7 +240,7 @@ class Person:
 
 
 class Walker:
-    """Carries the board to the wanted placement, as far as the room allows."""
+    """Carries the board towards the target placement, as far as the room allows."""
 
     def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, SensorPlace]) -> None:
         self._scene = scene
@@ -261,7 +261,7 @@ class Walker:
         self._way = self._scene.T_world_board, T_world_board, now_s, now_s + max(way_m / WALK_MPS, 0.5)
 
     def hear(self, camera: str, wanted: Array, now_s: float) -> None:
-        """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.
+        """Start towards a placement T_cam_board (4, 4), as far as the board can be held.
 
         Args:
             camera: whose placement it is.
@@ -278,7 +278,7 @@ class Walker:
                 return
 
     def walk(self, now_s: float) -> None:
-        """Move the board to its place on the way at a time."""
+        """Move the board along its path to its position at `now_s`."""
         if self._way is None:
             return
         start, end, from_s, until_s = self._way

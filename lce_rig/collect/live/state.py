@@ -1,4 +1,4 @@
-"""Options of a live collection, its state at one moment for the views, and its report."""
+"""Options of a live collection, a snapshot of its state for the views, and its report."""
 
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -21,16 +21,16 @@ Key = Literal["stop", "capture", "next"]
 
 @dataclass(frozen=True)
 class TakeBack:
-    """A request to take the last capture of this run back.
+    """A request to reject the last capture of this run.
 
     Attributes:
-        name: of the capture shown to the user: another one stays; "" for the last one.
+        name: name of the capture shown to the user: another one stays; "" for the last one.
     """
 
     name: str = ""
 
 
-#: Time for which a board stands still before its capture, beyond the first half second.
+#: Time for which a board must rest before its capture, beyond the first half second, s.
 HOLD_S = 1.5
 
 
@@ -102,7 +102,7 @@ Sound = Literal["tick", "captured", "taken_back", "refused", "enough", "lost"]
 
 
 class StreamState(NamedTuple):
-    """State of one stream, and whether the board is seen in it.
+    """State of one stream, and whether it shows the board.
 
     Attributes:
         name: "cam.frames", "lidar".
@@ -122,11 +122,11 @@ class StreamState(NamedTuple):
 
 
 class Cue(NamedTuple):
-    """A moment that is worth a sound.
+    """An event with a sound.
 
     Attributes:
         number: rises with every cue, so that a view plays each once.
-        sound: which.
+        sound: name of the sound.
     """
 
     number: int
@@ -134,7 +134,7 @@ class Cue(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """The camera's last image, with the present and the wanted outline of the board.
+    """The camera's last image, with the present and the target outline of the board.
 
     Attributes:
         camera: name of the stream.
@@ -156,12 +156,12 @@ class Drawing(NamedTuple):
 
 
 class LiveState(NamedTuple):
-    """One moment of a live collection.
+    """Snapshot of a live collection.
 
     Attributes:
         rig, session: the profile's name and the session's folder.
         elapsed_s: time since the start of the collection.
-        phase: of the collection.
+        phase: phase of the collection.
         headline: the one thing to do, large: "one step left, 0.5 m closer".
         detail: reason or progress, smaller; "" without either.
         hold_s: time that the board must still be held; None unless it is being held.
@@ -171,7 +171,7 @@ class LiveState(NamedTuple):
         last_capture: name of the capture that would be taken back; "" without one.
         streams: every stream.
         drawing: the guiding camera's image; None before the first.
-        coverage: of the reachable placements by the captures; None without guidance.
+        coverage: coverage of the reachable placements by the captures; None without guidance.
         sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN with few captures.
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.

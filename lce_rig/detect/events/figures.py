@@ -1,4 +1,4 @@
-"""Figures from events and a board tracked through their images, the profile's limits on them, and faults."""
+"""Figures of a board from events and its track, the profile's limits on them, and faults."""
 
 import math
 from dataclasses import replace
@@ -29,19 +29,19 @@ from lce_rig.detect.findings import (
 )
 from lce_rig.rig import QualitySettings
 
-#: Events older than this no longer show in the network's image.
+#: Age of events, ns, beyond which the network's image no longer shows them.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
-# Share of a DAVIS346's image taken by a board of 0.8 x 0.6 m at 3.5 m.
+# Fraction of a DAVIS346's image covered by a board of 0.8 x 0.6 m at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
-# Poses nearer in time than this do not determine a speed.
+# Minimum interval between poses that determine a speed, s.
 _MIN_TRACK_S = 0.03
 _ALONG = np.linspace(0, 1, 24)[:, None]
 
 
 def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Array:
-    """Draw the plate's outline as the lens bends it: (96, 2) px, closed, NaN if it cannot be seen."""
+    """Project the plate's outline: (96, 2) px, closed, with lens distortion; NaN if not visible."""
     corners = board.outline()
     edges = [a + _ALONG * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     pixels, _ = intrinsics.project(transform(T_cam_board, np.concatenate(edges)))
@@ -49,11 +49,11 @@ def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Arra
 
 
 def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuality:
-    """Measure how many events a board made; its motion stays unknown.
+    """Compute how many events a board caused; its motion stays unknown.
 
     Args:
         events: about the image.
-        stamp_ns: of the image.
+        stamp_ns: timestamp of the image.
         around_px: (M, 2) the board's outline in it.
     """
     outline = around_px[np.isfinite(around_px).all(axis=1)]
@@ -63,7 +63,7 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
         cv2.fillPoly(mask, [fixed.reshape(-1, 1, 2)], 1, cv2.LINE_8, _SUBPIXEL_BITS)
     remembered = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     recent = remembered.between(stamp_ns - _JUST_NS, stamp_ns)
-    # One flat index is twice as fast as two, and there are millions of events.
+    # One flat index is twice as fast as two, for millions of events.
     n_remembered, n_recent = (
         int(np.count_nonzero(mask.ravel().take(part.y.astype(np.int32) * mask.shape[1] + part.x)))
         for part in (remembered, recent)
@@ -73,11 +73,11 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
 
 
 def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
-    """Measure the time from a LiDAR's first to its last return from the board, s.
+    """Compute the time between a LiDAR's first and last return from the board, s.
 
     Args:
         lidar: the board in one scan; without firing times, its span in azimuth is used.
-        period_s: of one revolution.
+        period_s: duration of one revolution.
     """
     if lidar.offset_ns is not None and len(lidar.offset_ns):
         return float(np.ptp(lidar.offset_ns)) * 1e-9
@@ -88,7 +88,7 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
 
 
 def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None) -> EventQuality:
-    """Add the constant velocity fitted to the poses of a tracked board; nothing without a track.
+    """Add the constant velocity fitted to the poses of a tracked board; without a track, nothing changes.
 
     All poses have equal weights. With weights by covariance, in which depth and lateral position are
     correlated, a hand's lateral deviation from the line would appear as speed along the line of sight.
@@ -96,7 +96,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
     Args:
         measured: figures of the board's events.
         found: with its track.
-        sweep_s: how long the LiDAR sees the board; None if it does not.
+        sweep_s: duration of the LiDAR's returns from the board; None without any.
     """
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
     if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
@@ -129,7 +129,7 @@ def _length(vector: Array, cov: Array) -> tuple[float, float]:
     return length, float(np.sqrt(vector @ cov @ vector)) / length
 
 
-# Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
+# Boards at 2 to 5 cm/s cause 2 to 4 events/px in 1 s; below, a missing board was too slow.
 _SLOW_EVENTS_PX = 4.0
 
 
@@ -138,7 +138,7 @@ MIN_SPEED_MPS = 0.03
 
 
 def too_few_events(events_px: float, min_events_px: float, speed_mps: float = math.nan) -> Refusal:
-    """Refuse a board with too few events; of one known to have moved, the camera is the cause."""
+    """Refuse a board with too few events; if it is known to have moved, the camera is the cause."""
     if speed_mps >= MIN_SPEED_MPS:
         return IMAGE_FEW_EVENTS.refusal(events_px=events_px, min_events_px=min_events_px, speed_mps=speed_mps)
     return IMAGE_HARDLY_MOVED.refusal(events_px=events_px, min_events_px=min_events_px)
@@ -162,7 +162,7 @@ def gate_event_board(
         return found
     if q.events_px < limits.min_events_px:
         return too_few_events(q.events_px, limits.min_events_px, frame_speed_mps)
-    # Comparisons with a figure that is not known are false.
+    # Comparisons with an unknown (NaN) figure are false.
     if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
         return too_fast(q.speed_mps, limits.max_board_speed_mps)
     if q.turn_deg_s - 2 * q.turn_sigma_deg_s > limits.max_turn_deg_s:
@@ -188,7 +188,7 @@ def explain_missing_board(
 
     Args:
         events: about the image.
-        stamp_ns: of the image.
+        stamp_ns: timestamp of the image.
         seen: the refusal, because the image is missing or has no board in it.
         limits: `quality` of the rig profile.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
@@ -203,7 +203,7 @@ def explain_missing_board(
     n_hot, hot_share = int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))
     if hot_share > 0.5:  # most events
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
-    # Blocks of pixels together as large as a board, busiest first.
+    # Take as many pixel blocks as a board covers, busiest first.
     of_blocks = np.sort(events_per_block(recent))[::-1]
     busiest = of_blocks[: max(1, round(_BUSY_SHARE * len(of_blocks)))]
     events_px, needed_px = float(busiest.mean()) / BLOCK_PX**2, max(_SLOW_EVENTS_PX, limits.min_events_px)

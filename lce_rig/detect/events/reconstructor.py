@@ -1,4 +1,4 @@
-"""The recurrent network that makes images of events, and images of a stream at any requested time."""
+"""The recurrent network that reconstructs images from events, at any requested time of a stream."""
 
 import math
 from collections import deque
@@ -91,9 +91,9 @@ class ReconstructionModel:
         return -(-size_px // self._multiple) * self._multiple
 
 
-# From the network's arbitrary scale to 8 bits, without flicker.
+# Percentiles that map the network's arbitrary scale to 8 bits, without flicker.
 _PERCENTILES = (1.0, 99.0)
-# Smallest spread that is stretched to the full range: below it there is noise, not contrast.
+# Smallest spread that is stretched to the full range: below it is noise, not contrast.
 _MIN_SPREAD = 0.05
 _SCALE_MEMORY = 0.8
 
@@ -105,7 +105,7 @@ class IntensityScale:
         self._smooth: NDArray[np.float64] | None = None
 
     def follow(self, picture: FloatArray) -> None:
-        """Take the next image of the stream into account, (H, W)."""
+        """Update the scale with the stream's next image, (H, W)."""
         bounds = _bounds(picture)
         if self._smooth is not None:
             bounds = _SCALE_MEMORY * self._smooth + (1 - _SCALE_MEMORY) * bounds
@@ -125,11 +125,13 @@ def _bounds(picture: FloatArray) -> NDArray[np.float64]:
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
 
 
-# Minimum fill of a window judged alone, not with the previous one: too few events make noise, not edges.
+# Minimum fill of a window that is used alone, not merged with the previous one: too few events give noise,
+# not edges.
 _MIN_FILL = 0.5
-# Nothing happens in a longer silence: it is passed over in one stride, states kept.
+# Longest silence that is processed step by step, ns: a longer one is skipped at once, and the states are
+# kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
-# A stream cut off at the timestamp ends with its last event, a little before.
+# Largest time from a stream's last event to a requested timestamp at its end, ns.
 _MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
 # Number of steps until the states have settled, on a real DAVIS346 recording.
@@ -138,7 +140,7 @@ N_WARM_UP = 12
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """A stretch of the stream and the states before it."""
+    """A range of the stream and the states before it."""
 
     start_ns: int
     events: Events
@@ -146,7 +148,7 @@ class _Window:
 
 
 class Reconstructor:
-    """Runs over one event stream, with a recurrent state for the whole stream.
+    """Runs the network over one event stream, with a recurrent state for the whole stream.
 
     Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
     asked for change the network's state: an image at a timestamp is a side step from the running state with
@@ -203,7 +205,7 @@ class Reconstructor:
                 yield READ_OUTSIDE_EVENTS.refusal(gap_s=1e-9 * late_ns)
 
     def feed(self, events: Events) -> None:
-        """Add the next events of a continuing stream; `picture_at` returns its images.
+        """Add the next events of the stream; `picture_at` returns its images.
 
         Args:
             events: up to the next timestamp that an image will be asked for, or shorter.
@@ -272,7 +274,7 @@ class Reconstructor:
         return WindowRule.of(events.height_px * events.width_px, self._share)
 
     def _advance(self, until_ns: int) -> None:
-        """Take every step whose window is complete by then."""
+        """Run every step whose window is complete at that time."""
         while self._current is not None:
             events = self._current.events
             if len(events) and int(events.t_ns[0]) - self._current.start_ns > _LONGEST_SILENCE_NS:
@@ -283,7 +285,7 @@ class Reconstructor:
             self._commit(end_ns)
 
     def _commit(self, end_ns: int) -> FloatArray:
-        """Close the current window and step; its remaining events begin the next one."""
+        """Close the current window and run its step; the remaining events start the next window."""
         assert self._current is not None
         window = self._current
         events = window.events.between(window.start_ns, end_ns)

@@ -1,4 +1,4 @@
-"""The board in a stream of events: detected in an image at the requested time, and tracked through others."""
+"""The board in a stream of events: detected in an image at the requested time, and tracked in others."""
 
 import math
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from lce_rig.rig import QualitySettings
 def nearest_pose(
     found: ImageBoard, T_near: Array, board: Board, intrinsics: Intrinsics
 ) -> tuple[Array, Array]:
-    """Choose the pose turned least against T_near (4, 4) of those that an image admits.
+    """Choose the pose with the smallest rotation from T_near (4, 4) among those compatible with an image.
 
     An image admits two poses. Without markers, the pattern looks the same when rotated by 180 deg, a square
     one by 90 deg, except for the colours of its squares, which a reconstruction can have wrong: all such
@@ -50,7 +50,7 @@ def nearest_pose(
 
 #: Times after the main image of the additional images in which the board is searched, ns.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
-# Maximum rotation by hand between neighbouring images; beyond, it is another board, or misread.
+# Maximum rotation by hand between neighbouring images, rad; above, it is another board or a wrong detection.
 _MAX_TURN_RAD = np.radians(45)
 
 
@@ -65,16 +65,16 @@ def find_event_board(
     sweep_s: float | None = None,
     frame_speed_mps: float = math.nan,
 ) -> tuple[Image | Refusal, ImageBoard | Refusal]:
-    """Reconstruct an image from the events up to a timestamp, find the board and follow it to either side.
+    """Reconstruct an image at a timestamp, find the board and track it backwards and forwards.
 
     Args:
         events: from long enough before the timestamp for the network to settle.
         stamp_ns: on the events' clock.
         reconstructor: is reset.
         board: the board as the profile describes it.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         limits: `quality` of the rig profile.
-        sweep_s: how long the LiDAR sees the board; None if it does not.
+        sweep_s: duration of the LiDAR's returns from the board; None without any.
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
 
     Returns:
@@ -108,7 +108,7 @@ def _followed(
     intrinsics: Intrinsics,
     limits: QualitySettings,
 ) -> ImageBoard:
-    """Follow the board from its main image to either side, and keep its poses as the track."""
+    """Track the board from its main image backwards and forwards, and return its poses as the track."""
     assert main.stamp_ns is not None
     track: dict[int, tuple[Array, Array]] = {}
     stamps = sorted(others)

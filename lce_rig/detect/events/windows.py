@@ -1,4 +1,4 @@
-"""Windows of events: how long they are gathered, without noise, and the arrays that they are summed into."""
+"""Windows of events: their length, noise removal, and their sums as input arrays."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events
 
-# Events per pixel and step: the network's training value, and E2VID's usual one.
+# Events per pixel and step: the network's training value, and E2VID's default.
 _EVENTS_PER_PIXEL = 0.35
 BLOCK_PX = 16
-# Share of active pixel blocks in a typical scene with the camera moving; see `active_share`.
+# Fraction of active pixel blocks in a typical scene with a moving camera; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
 _LONGEST_NS = 60_000_000
@@ -19,13 +19,13 @@ _SHORTEST_NS = 20_000_000
 
 
 class WindowRule(NamedTuple):
-    """When the current window ends: at n_events and 20 ms both, or at 60 ms."""
+    """Rule for the end of the current window: at n_events and 20 ms both, or at 60 ms."""
 
     n_events: int
 
     @classmethod
     def of(cls, n_pixels: int, share: float) -> "WindowRule":
-        """Settle the next window's end from the share of a sensor's pixels that is active."""
+        """Set the next window's length from the active fraction of a sensor's pixels."""
         relative = min(1.0, max(share, _MIN_ACTIVE_SHARE) / _USUAL_ACTIVE_SHARE)
         return cls(max(1, round(_EVENTS_PER_PIXEL * n_pixels * relative)))
 
@@ -42,14 +42,14 @@ class WindowRule(NamedTuple):
         ends = [longest_end] if len(events) and int(events.t_ns[-1]) >= longest_end else []
         if len(events) >= self.n_events:
             filled = max(int(events.t_ns[self.n_events - 1]) + 1, start_ns + _SHORTEST_NS)
-            # Equal timestamps may go on in events yet to come: wait for a later one.
+            # Later events may have the same timestamp: wait for a larger one.
             if int(events.t_ns[-1]) >= filled:
                 ends.append(filled)
         return min(ends, default=None)
 
 
 def active_share(events: Events) -> float:
-    """Measure the share of the sensor that the events cover: (sum n)^2 / (B sum n^2) over B blocks.
+    """Compute the fraction of the sensor covered by the events: (sum n)^2 / (B sum n^2) over B blocks.
 
     The participation ratio depends only on the spread of the events, not on their number; with it a small
     board before a still background gets windows of the same few pixels of motion as a full image.
@@ -61,7 +61,7 @@ def active_share(events: Events) -> float:
 
 
 def events_per_block(events: Events) -> NDArray[np.float64]:
-    """Count the events of each block of 16 x 16 pixels (B,)."""
+    """Count the events in each block of 16 x 16 pixels (B,)."""
     n_cols, n_rows = -(-events.width_px // BLOCK_PX), -(-events.height_px // BLOCK_PX)
     block = (events.y // BLOCK_PX).astype(np.intp) * n_cols + events.x // BLOCK_PX
     return np.bincount(block, minlength=n_cols * n_rows).astype(np.float64)
@@ -112,7 +112,7 @@ def voxel_grid(events: Events, n_bins: int, start_ns: int, end_ns: int) -> Float
 
 
 def normalise_voxels(voxels: FloatArray) -> FloatArray:
-    """Bring the non-zero voxels to mean 0 and standard deviation 1, in place; zeros stay zeros.
+    """Normalise the non-zero voxels to mean 0 and standard deviation 1, in place; zeros stay zero.
 
     References:
         Rebecq et al., High speed and high dynamic range video with an event camera, TPAMI 2019.
@@ -132,7 +132,7 @@ _SUPPORT_NS = 10_000_000
 
 
 class NoiseFilter:
-    """Learns along the stream which pixels are hot, and removes their events and isolated ones."""
+    """Learns the hot pixels along the stream, and removes their events and isolated ones."""
 
     def __init__(self) -> None:
         self._n_events: NDArray[np.int64] | None = None
@@ -140,7 +140,7 @@ class NoiseFilter:
         self._is_hot: NDArray[np.bool_] | None = None
 
     def learn(self, events: Events) -> None:
-        """Count the next stretch of the stream; twice a second the hot pixels are determined again."""
+        """Count the next part of the stream; update the hot pixels twice a second."""
         if not len(events):
             return
         if self._n_events is None:
@@ -154,14 +154,14 @@ class NoiseFilter:
             self._since_ns = last_ns
 
     def clean(self, events: Events) -> Events:
-        """Remove the events of hot pixels known so far and background activity."""
+        """Remove background activity and the events of known hot pixels."""
         if self._is_hot is not None and self._is_hot.any():
             events = events.select(~self._is_hot[events.y, events.x])
         return without_background_activity(events)
 
 
 def hot_pixels(n_events: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Find pixels that fire on their own, (H, W), from events per pixel over half a second or more, (H, W).
+    """Find hot pixels (H, W) from events per pixel over half a second or more, (H, W).
 
     Real edges pass over neighbours too, whichever way they move; a hot pixel's neighbours stay quiet. The
     median of the neighbours is blind to a second hot pixel next door.
@@ -208,7 +208,7 @@ _FLICKER_COHERENCE = 0.5
 
 
 def is_flickering(events: Events) -> bool:
-    """Return whether flickering lamps, or a light switched on or off, made most events of about a second.
+    """Check whether flickering or switched lamps caused most events of about a second.
 
     All pixels that see such light turn brighter together, then darker; moving edges make both at any time.
     The root mean product of the polarities of two events of one millisecond separates the two.
@@ -218,6 +218,6 @@ def is_flickering(events: Events) -> bool:
     bins = (events.t_ns - events.t_ns[0]) // _BIN_NS
     counts = np.bincount(bins)
     signed = 2.0 * np.bincount(bins, events.polarity) - counts
-    # Few events do not look coherent: an event is not compared with itself.
+    # Pairs of an event with itself are excluded, so that few events do not look coherent.
     n_pairs = float((counts * (counts - 1)).sum())
     return bool(n_pairs and (signed**2 - counts).sum() > _FLICKER_COHERENCE**2 * n_pairs)

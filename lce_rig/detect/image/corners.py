@@ -13,7 +13,7 @@ from lce_rig.detect.image.saddle import Crossings, fit_crossings, sample
 
 Grey = NDArray[np.uint8]
 
-# Images wider than this are first searched at half their size, narrower ones at twice: the finders want
+# Image width, px, below which images are first searched at twice their size, above at half: the finders need
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
@@ -31,7 +31,7 @@ _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 
 def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossings | None:
-    """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
+    """Find the inner corners with sub-pixel accuracy, trying the cheapest method first.
 
     Args:
         grey: (H, W).
@@ -63,7 +63,7 @@ def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossing
 
 
 def seen_grid(grey: Grey) -> Array | None:
-    """Find a checkerboard of any size of at least 5x4 inner corners in (H, W), in about 30 ms.
+    """Find a checkerboard with 5x4 or more inner corners in (H, W), in about 30 ms.
 
     Returns:
         (rows, cols, 2) px; rows and cols may be exchanged. None if nothing is found.
@@ -104,7 +104,7 @@ def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
 
 
 def black_top_left(grey: Grey, grid_px: Array) -> float:
-    """Measure by how many grey values the squares of the top left one's colour are darker than the others.
+    """Compute how much darker the squares of the top left one's colour are than the others, grey values.
 
     Args:
         grey: (H, W).
@@ -122,28 +122,28 @@ def square_values(grey: Grey, grid_px: Array) -> Array:
 
 
 def _attempts(grey: Grey, size: tuple[int, int], is_thorough: bool) -> Iterator[Array | None]:
-    """Run the finder at one scale after the other, cheapest first; the caller stops at the first success.
+    """Run the finder at several scales, cheapest first; the caller stops at the first success.
 
     The list is fixed, not timed, so that the same image gives the same answer on any machine. OpenCV's older
     finder is not run: in 455 images of 17 recordings it found no board that these had missed.
     """
     width = grey.shape[1]
     if width <= _WIDE_PX:
-        # A far board in a small image, of which `seen_grid` sees a part.
+        # A distant board in a small image, partly found by `seen_grid`.
         yield _sector_based(grey, size, 2.0, cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not is_thorough:
         return
     if width > _WIDE_PX:
-        # Squares of 10 px, as of a board 5 m away, are too small at half the size.
+        # Squares of 10 px, of a board 5 m away for example, are too small at half the size.
         yield _sector_based(grey, size, min(1.0, 1280 / width), _SB_THOROUGH)
         return
     yield _sector_based(level_contrast(grey), size, 1.5, _SB_THOROUGH)
-    # Squares of 4 px in an image of full contrast, as those made from events are.
+    # Squares of 4 px in an image of full contrast, such as one reconstructed from events.
     yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
 
 
 def level_contrast(grey: Grey) -> Grey:
-    """Bring every neighbourhood of a low-contrast image to the same mean and spread."""
+    """Equalise the mean and spread of every neighbourhood of a low-contrast image."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     mean = cv2.GaussianBlur(smooth, (0, 0), 8.0)
     spread = np.sqrt(cv2.GaussianBlur((smooth - mean) ** 2, (0, 0), 8.0)) + 4.0
@@ -157,7 +157,7 @@ def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -
 
 
 def resize(grey: Grey, scale: float) -> Grey:
-    """Scale an image: cubic to enlarge it, by areas to shrink it."""
+    """Scale an image: cubic interpolation to enlarge it, area averaging to shrink it."""
     if scale == 1.0:
         return grey
     how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
@@ -180,7 +180,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
     Args:
         grey: (H, W).
         size: (cols, rows); either may be the rows.
-        scale: of the image that is searched.
+        scale: scale of the image that is searched.
 
     Returns:
         (rows * cols, 2) px, row by row, to about half a pixel; None if no such grid is found.
@@ -223,7 +223,7 @@ def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
     # Offset from the pixel to the zero of the slope; Sobel's second derivatives are four times as large.
     slope = np.stack([smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1) / 2
     shift = np.clip(-4.0 * np.linalg.solve(H, slope[..., None])[..., 0], -1.0, 1.0)
-    # Along the edges the second derivative vanishes: between the eigenvectors, in the ratio of their values.
+    # Along the edges the second derivative vanishes: their angle follows from the ratio of the eigenvalues.
     half = np.arctan(np.sqrt(np.maximum(values[:, 1], 1e-9) / np.maximum(-values[:, 0], 1e-9)))
     middle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     angles = np.stack([middle - half, middle + half], axis=1)
@@ -232,7 +232,7 @@ def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
 
 
 def _link(points: Array, edges: Array, strengths: Array) -> dict[int, dict[int, tuple[int, int]]]:
-    """Link points that are each other's nearest along their edges, by point and side: (neighbour, its side).
+    """Link mutually nearest points along their edges, by point and side: (neighbour, its side).
 
     Sides 0 to 3 are the first edge, the second, and both backwards.
     """

@@ -1,4 +1,4 @@
-"""Corners of ChArUco boards and AprilGrids: markers identify them, crossings measure them.
+"""Corners of ChArUco boards and AprilGrids: markers identify them, crossings locate them.
 
 OpenCV finds markers. Those whose places on the board agree with one pose predict every corner, and each is
 measured as a checkerboard's, by the edges about it. Corners that do not look as printed are hidden.
@@ -35,22 +35,23 @@ _WIDE_PX = 700
 _MIN_MARKERS = 2
 # Maximum distance of a marker's corners from the pose's prediction, in sides of a marker.
 _MAX_AWAY = 0.25
-# Minimum share of the board's markers that fit one pose, if their layout is the profile's.
+# Minimum fraction of the board's markers that fit one pose, if their layout is the profile's.
 _MIN_FITTING = 0.6
-# Minimum share of foreign markers for a refusal: another board is in the image, or a second one.
+# Minimum fraction of foreign markers for a refusal: the image shows another board, or a second one.
 _MIN_FOREIGN = 0.15
 # Limits of a corner, relative to the others: minimum contrast, maximum misfit of the grey values.
 _MIN_CONTRAST, _MAX_MISFIT = 0.5, 2.0
 # Maximum distance of a corner from the pose's prediction, in units of the median.
 _MAX_OFF = 7.0
-# Maximum ratio of new corners to followed ones; beyond, the board is searched for again.
+# Maximum ratio of new corners to tracked ones; above, the board is searched for again.
 _MOST_NEW = 0.25
-# Measured length of edges, as a share of the way to the next printed element.
+# Length of the fitted part of the edges, as a fraction of the distance to the next printed element.
 _FREE = 0.8
-# Threshold of black below its surroundings, grey values: least, most; in sigmas of an AprilGrid's noise.
+# Threshold of black below its surroundings: minimum and maximum in grey values, and in standard deviations of
+# an AprilGrid's noise.
 _DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
-# Limits of the gaps' difference from the profile's: in sides of a tag (more moves poses by centimetres), and
-# in standard deviations of the measurement (fewer are not significant).
+# Limits of the spacing's difference from the profile's: in tag sides (larger ones shift poses by
+# centimetres), and in standard deviations (smaller ones are not significant).
 _MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
 _GAP_SHARES = (0.05, 1.2)
 
@@ -63,7 +64,7 @@ def find_marked_grid(
     Args:
         grey: (H, W).
         board: one that has markers.
-        intrinsics: of the camera; rough ones are sufficient.
+        intrinsics: intrinsics of the camera; rough ones are sufficient.
         is_thorough: whether to search at further scales, and for markers of other dictionaries.
 
     Returns:
@@ -95,7 +96,7 @@ def find_marked_grid(
 def keep_marked(
     grey: Grey, board: Board, crossings: Crossings, was_seen: NDArray[np.bool_]
 ) -> Crossings | None:
-    """Hide the corners that a board which is followed did not show in the image before.
+    """Hide the corners of a tracked board that the previous image did not show.
 
     Args:
         grey: (H, W).
@@ -118,17 +119,17 @@ def keep_marked(
 
 
 def marker_corners(grey: Grey, board: Board) -> Array:
-    """List the corners (N, 2) px of the markers in an image, the board's or not."""
+    """List the corners (N, 2) px of all markers in an image, the board's or not."""
     places = _search(grey, board, is_thorough=False)
     return np.concatenate([np.zeros((0, 2)), *places.values()])
 
 
 def _search(grey: Grey, board: Board, *, is_thorough: bool) -> Places:
-    """Find markers of the board's dictionary, at one scale or until half of the board's are found."""
+    """Find markers of the board's dictionary, at one scale or until half of them are found."""
     places: Places = {}
     darker = _DARKER
     if board.type == "aprilgrid":
-        # Black specks of noise join tags to the squares at their corners. Markers of ChArUco boards touch
+        # Black noise pixels join tags to the squares at their corners. Markers of ChArUco boards touch
         # nothing, and their narrow white margins need the lower threshold.
         darker = min(max(_DARKER_SIGMAS * _noise(grey), _DARKER), _MOST_DARKER)
     for scale, n_border in _attempts(grey.shape[1], board):
@@ -153,7 +154,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = n_border
     parameters.minMarkerPerimeterRate = 0.015
-    # Finds seven times as many tags with modules of 2 px as OpenCV's defaults.
+    # This finds seven times as many tags with modules of 2 px as OpenCV's default.
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.errorCorrectionRate = 1.0
@@ -167,7 +168,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
 
 
 def _noise(grey: Grey) -> float:
-    """Estimate the standard deviation of an image's noise, by its second differences across both axes."""
+    """Estimate the standard deviation of an image's noise from its second differences along both axes."""
     across = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     rough = cv2.filter2D(grey, cv2.CV_16S, across)[1:-1:3, 1:-1:3]
     # The median magnitude of normal noise is 0.67 standard deviations; the filter multiplies these by six.
@@ -175,7 +176,7 @@ def _noise(grey: Grey) -> float:
 
 
 def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
-    """Find a dictionary with more markers in the image than the board's n_own; None if there is none."""
+    """Find a dictionary with more markers in the image than the board's n_own; None without one."""
     own = _family(board.dictionary)
     best, most = "", max(n_own, 3)
     # The largest dictionary of a family includes the markers of the smaller ones.
@@ -189,7 +190,7 @@ def _other_dictionary(grey: Grey, board: Board, n_own: int) -> Refusal | None:
 
 
 def _family(dictionary: str) -> str:
-    """Return a dictionary's name without its size, as "5X5" of 5X5_100; each AprilTag one is a family."""
+    """Return a dictionary's name without its size: "5X5" for 5X5_100; each AprilTag one is its own family."""
     return dictionary.partition("_")[0] if dictionary[0].isdigit() else dictionary
 
 
@@ -223,7 +224,7 @@ def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array 
 
 
 def _flatten(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return where rays of pixels (..., 2) meet the plane at z = 1; NaN for those far to the side."""
+    """Intersect the rays of pixels (..., 2) with the plane z = 1; NaN for those far to the side."""
     rays = intrinsics.unproject(pixels.reshape(-1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         flat = np.where(rays[:, 2:] > 0.05, rays[:, :2] / rays[:, 2:], np.nan)
@@ -231,7 +232,7 @@ def _flatten(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> float | None:
-    """Measure the gaps between tags, of their side, by the homography; None if they are the profile's.
+    """Estimate the tag spacing by a homography, in tag sides; None if it matches the profile.
 
     A wrong gap shrinks or stretches single rows and columns: neither a pose nor a lens does.
     """
@@ -257,7 +258,7 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
 
 
 def _readings(board: Board) -> Iterator[tuple[Markers, int, bool]]:
-    """List markers, by how many corners theirs are turned, and whether they are those of old boards."""
+    """List readings of the markers: rotation of their corners, and whether the board is an old one."""
     yield markers_of(board), 0, False
     if board.type == "aprilgrid":
         yield markers_of(board), 2, False
@@ -283,7 +284,7 @@ def _fits(on_board: Array, flat: Array, is_ahead: NDArray[np.bool_]) -> NDArray[
 def _measure(
     grey: Grey, board: Board, intrinsics: Intrinsics, T_cam_board: Array, is_legacy: bool
 ) -> tuple[Crossings | None, int]:
-    """Measure the corners near a pose's prediction; None if too few are visible, and their number."""
+    """Locate the corners near a pose's prediction, and count them; None if too few are visible."""
     shape, corners = (board.rows, board.cols), board.corners()
     signs = _signs(board) * (-1 if is_legacy else 1)
     grid_px = intrinsics.project(transform(T_cam_board, corners))[0].reshape(*shape, 2)
@@ -292,7 +293,7 @@ def _measure(
             return None, 0
         crossings = fit_crossings(grey, grid_px, patches=marked_patches(board, intrinsics, T_cam_board))
         is_seen = _as_printed(grey, crossings, signs)
-        # The better half of them is hardly covered, so it alone determines the first pose.
+        # The better half is hardly covered, so it alone determines the first pose.
         usual = np.median(crossings.misfit[is_seen]) if is_seen.any() else 0.0
         is_trusted = is_seen & (crossings.misfit <= usual)
         for _ in range(3):
@@ -308,7 +309,7 @@ def _measure(
             away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
             is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
             is_trusted, T_cam_board = is_seen, solved.T_cam_board
-        # Patches centred on their corners are free of neighbouring print.
+        # Patches centred on their corners do not contain neighbouring print.
         grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
     crossings.grid_px[~is_seen] = np.nan
     crossings.is_fitted[...] = is_seen
@@ -316,7 +317,7 @@ def _measure(
 
 
 def _signs(board: Board) -> Array:
-    """List the signs of the corners' contrasts (rows, cols); old ChArUco boards have the others.
+    """List the signs of the corners' contrasts (rows, cols), inverted for old ChArUco boards.
 
     The corner at the upper left of a black square or tag is dark there and at its lower right.
     """
@@ -324,7 +325,7 @@ def _signs(board: Board) -> Array:
 
 
 def _as_printed(grey: Grey, crossings: Crossings, signs: Array) -> NDArray[np.bool_]:
-    """Find the corners (rows, cols) whose surroundings look as others', with the colours of the print."""
+    """Find the corners (rows, cols) whose surroundings match the others' and the printed colours."""
     height, width = grey.shape
     contrast = signs * crossings.contrast
     is_good = crossings.is_fitted & (contrast > 0)
@@ -337,7 +338,7 @@ def _as_printed(grey: Grey, crossings: Crossings, signs: Array) -> NDArray[np.bo
 
 
 def marked_patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> Patches:
-    """Describe the surroundings of the corners in an image, which markers narrow."""
+    """Describe the patches around the corners in an image, limited by the markers."""
     if board.type == "charuco":
         unit_m, clear_m = board.square_m, _FREE * (1 - board.marker_share) / 2 * board.square_m
     else:

@@ -1,4 +1,4 @@
-"""Figures of the board in an image, and the refusals that follow from them."""
+"""Figures of the board in an image, and the resulting refusals."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +28,16 @@ LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
 LEAST_MARKED_PX = 20.0
 """Least side of a square with a marker, or of a tag, from which markers are read without fail."""
-# Limits of camera images: least difference of black and white, grey values; fewest edge widths in a square.
+# Limits of camera images: minimum contrast of black and white, grey values; minimum edge widths per square.
 _MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
-# Limits of images without a board: least grey spread, and greatest width of the strongest edges.
+# Limits of images without a board: minimum grey spread, and maximum width of the strongest edges, px.
 _MIN_SPREAD, _MAX_EDGE_PX = 50.0, 6.0
-# Minimum ratio of the outer squares' contrast to the inner ones'; off the board, a line's are all the same.
+# Minimum ratio of the outer squares' contrast to the inner ones'; off the board, a row has no contrast.
 _MIN_OUTER_CONTRAST = 0.35
 
 
 def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
-    """Measure the corners' surroundings; corners at NaN are hidden."""
+    """Measure the surroundings of the corners; NaN corners are hidden."""
     grid = crossings.grid_px
     height, width = grey.shape
     is_seen = np.isfinite(grid[..., 0])
@@ -57,7 +57,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
 
 
 def _shortest_side_px(grid_px: Array) -> float:
-    """Measure the shortest side of a square, px; without visible neighbours, from other corners."""
+    """Return a square's shortest side, px; estimated from other corners if no neighbours are visible."""
     sides = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
     if np.isfinite(lengths).any():
@@ -70,20 +70,22 @@ def _shortest_side_px(grid_px: Array) -> float:
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
-    """Check that the pattern ends at the border of the grid of corners.
+    """Check whether the grid of corners covers the whole pattern.
 
-    The squares outside the outermost corners must alternate as those inside do, the next ones must not.
+    One row of squares surrounds the outermost corners. It must alternate like the inner squares, and the
+    next row outwards must not.
 
     Args:
-        grid_px: (rows, cols, 2).
+        grey: (H, W) the image.
+        grid_px: (rows, cols, 2) the corners.
 
     Returns:
-        Contrast of the weakest side of outer squares over that of the inner squares, 1 on a clean board, and
-        whether the squares go on beyond them on some side, so that only a part of a larger board was taken.
+        Lowest contrast of the four surrounding rows, relative to the inner squares (1 on a clean board), and
+        whether the squares continue beyond any of them: then the grid is part of a larger board.
     """
     wide = _widened(_widened(grid_px))
     height, width = grey.shape
-    # Pixels beyond the border repeat its value, and so do not alternate.
+    # Pixels beyond the border repeat its value and therefore do not alternate.
     values = square_values(grey, np.clip(wide, 0, [width - 1, height - 1]))
     signs = (-1.0) ** np.indices(values.shape).sum(axis=0)
     inner = _alternation(values[2:-2, 2:-2], signs[2:-2, 2:-2])
@@ -99,7 +101,7 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
 
 
 def is_whole(grey: NDArray[np.uint8], grid_px: Array) -> bool:
-    """Check that a grid of corners is a whole pattern, and so its number of corners that of a board."""
+    """Check that a grid of corners covers a whole pattern, so that its size identifies the board."""
     outer_contrast, goes_on = extent(grey, grid_px)
     return outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on
 
@@ -113,7 +115,7 @@ def _widened(grid_px: Array) -> Array:
 
 
 def _alternation(values: Array, signs: Array) -> float:
-    """Compute the mean excess of the values of positive sign over the others."""
+    """Compute the mean difference between the values of positive and of negative sign."""
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 
@@ -143,7 +145,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
 def explain_other_grid(
     grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
 ) -> Refusal:
-    """Say that another grid of corners is in the image than the profile's, or only a part of it is found.
+    """Report that the image shows a grid of another size than the profile's, or only part of it.
 
     The number of corners detected is stated only if they are a whole pattern.
 
@@ -155,7 +157,7 @@ def explain_other_grid(
     """
     rows, cols = seen_px.shape[:2]
     wanted = board.cols, board.rows
-    # The grid turned the way that is nearer to the board.
+    # Orient the grid like the board.
     turned = ((cols, rows), (rows, cols))
     seen = min(turned, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
     figures: dict[str, Figure] = {"n_cols": wanted[0], "n_rows": wanted[1]}
@@ -173,7 +175,7 @@ def explain_other_grid(
     if is_whole(grey, seen_px):
         figures |= {"n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     if is_part:
-        # A pattern that continues beyond the corners found is neither covered nor another one.
+        # A pattern that continues beyond the detected corners is neither covered nor another one.
         kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
         return kind.refusal(action=action, **figures)
     return IMAGE_OTHER_BOARD.refusal(**figures)
@@ -182,7 +184,7 @@ def explain_other_grid(
 def quality_problem(
     quality: ImageQuality, limits: QualitySettings, is_from_events: bool = False
 ) -> Refusal | None:
-    """Judge the figures of a detected grid; None if they are sufficient."""
+    """Compare the figures of a detected grid with the limits; None if they are sufficient."""
     action = "events" if is_from_events else ""
     min_contrast = limits.min_event_contrast if is_from_events else _MIN_CONTRAST
     min_sharpness = limits.min_event_sharpness if is_from_events else _MIN_SHARPNESS

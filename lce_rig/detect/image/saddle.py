@@ -13,14 +13,14 @@ from lce_rig.core.geometry import Array
 # next corners stay outside.
 REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
-# Samples per side and steps of a first, coarse fit; it saves steps of the final one, which is slower.
+# Samples per side and steps of a first, coarse fit; it saves steps of the slower final one.
 _COARSE_SAMPLES = 9
 _COARSE_STEPS = 6
-# Spacing of samples from which the image is blurred first, px.
+# Spacing of samples above which the image is blurred first, px.
 _FAR_APART_PX = 1.3
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
-# Fits that gain no more than this share of their cost in a step are done: corners rest within their noise.
+# Relative decrease of the cost below which a fit is finished: corners then move less than their noise.
 _SETTLED = 1e-5
 
 
@@ -44,7 +44,7 @@ class Crossings:
 
 
 class Patches(NamedTuple):
-    """The surroundings of corners that do not lie between squares of a checkerboard.
+    """The surroundings of corners of boards with markers.
 
     Attributes:
         e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
@@ -81,7 +81,7 @@ def fit_crossings(
     n_coarse = min(_COARSE_SAMPLES, most_samples)
     coarse, parameters = _fit_patches(grey, grid_px, n_coarse, None, patches, _COARSE_STEPS)
     if not coarse.is_fitted.all():
-        # A patch that slips from its corner pulls no other one along.
+        # Patches are independent: one that slips from its corner does not affect the others.
         return _fit_patches(grey, grid_px, most_samples, None, patches)[0]
     return _fit_patches(grey, coarse.grid_px, most_samples, parameters, patches)[0]
 
@@ -99,7 +99,7 @@ def _fit_patches(
         patches = Patches(np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0), REACH)
     e1, e2, clear = patches
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
-    # Width of a square across its edges: length of one unit of a and of b, px.
+    # Distance between opposite edges of a square, px: the length of one unit of a and of b.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
     n = int(np.clip(2 * round(REACH * longest_px) + 1, 7, most_samples))
@@ -110,7 +110,7 @@ def _fit_patches(
     is_clear = np.minimum(np.abs(a), np.abs(b)) <= clear + 1e-9
     a, b = a[is_clear], b[is_clear]
     pixels = grid_px[..., None, :] + a[:, None] * e1[..., None, :] + b[:, None] * e2[..., None, :]
-    # Samples far apart would see a sharp edge jump between them, and corners would rest anywhere there.
+    # Widely spaced samples would let a sharp edge jump between them, leaving the corner undetermined.
     step_px = 2 * REACH * longest_px / (n - 1)
     blur_px = 0.4 * step_px if step_px > _FAR_APART_PX else 0.0
     values = _sample_smooth(grey, pixels, blur_px).reshape(-1, len(a))
@@ -140,7 +140,7 @@ def _fit_patches(
 
 
 def sample(grey: NDArray[np.uint8] | NDArray[np.float32], pixels: Array) -> Array:
-    """Interpolate grey values bilinearly at (..., 2) px; beyond the border its value is kept."""
+    """Interpolate grey values bilinearly at (..., 2) px; outside the image the border value is used."""
     # cv2.remap takes at most 32766 rows and columns.
     maps = np.asarray(pixels, dtype=np.float32).reshape(-1, pixels.shape[-2], 2)
     values = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -148,7 +148,7 @@ def sample(grey: NDArray[np.uint8] | NDArray[np.float32], pixels: Array) -> Arra
 
 
 def _sample_smooth(grey: NDArray[np.uint8], pixels: Array, blur_px: float) -> Array:
-    """Sample the image under Gaussian blur; only the part about the pixels is blurred."""
+    """Sample the image after Gaussian blur; only the part around the pixels is blurred."""
     if not blur_px:
         return sample(grey, pixels)
     reach = np.ceil(4 * blur_px) + 1
@@ -178,7 +178,7 @@ def _fit(
 
     `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
     """
-    # Without a start the corners are assumed in the middles of their patches.
+    # Without a start the corners are assumed at the centres of their patches.
     mean = values.mean(axis=1)
     p, lowest = np.zeros((len(values), 8)), np.log(least_sigma_px / height_px)
     p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
@@ -192,7 +192,7 @@ def _fit(
     k = np.arange(len(p))  # Fits that are not done.
     for _ in range(n_steps):
         J_k = J if len(k) == len(p) else J[k]
-        # Blurs at their bounds that would go beyond stay there: the others then settle in few steps.
+        # Keep blurs at their bounds if a step would exceed these: the others then converge in few steps.
         gradient = (J_k @ residuals[k, :, None])[..., 0]
         is_held = np.zeros((len(k), 8), dtype=bool)
         is_held[:, 6:8] = ((p[k, 6:8] <= lowest[k]) & (gradient[:, 6:8] > 0)) | (

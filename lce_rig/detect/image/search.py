@@ -1,4 +1,4 @@
-"""The board in an image: corners, both poses and figures, or why there is none."""
+"""The board in an image: corners, both poses and figures, or the reason why it is missing."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,12 +35,12 @@ STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Hint of a search that was not thorough."""
 
-# Maximum excess of a canvas over the sensor, in sizes of the sensor; a larger one costs memory.
+# Maximum excess of an image over the sensor, relative to the sensor's size; a larger canvas costs memory.
 _CANVAS_FRACTION = 3.0
-# Maximum share of corners that the finder misplaced, or that an artefact covers.
+# Maximum fraction of corners that the finder misplaced or an artefact covers.
 _MAX_MISPLACED = 0.08
-# A quarter of a full fit's time; the corners' standard deviation is then 0.03 px, sufficient for stillness
-# and guidance.
+# Samples per side for tracked boards: a quarter of a full fit's time; corners have 0.03 px, sufficient for
+# stillness and guidance.
 _FOLLOWED_SAMPLES = 13
 # Maximum movement of a still board's corners, px.
 _RESTING_PX = 0.5
@@ -67,7 +67,7 @@ def find_image_board(
     Args:
         image: the image.
         board: the board as the profile describes it.
-        intrinsics: of the camera, at the image's resolution.
+        intrinsics: intrinsics of the camera, at the image's resolution.
         last: the board in the previous image: if it is within a third of a square of its place there, the
             search is skipped; else its surroundings are searched first.
         limits: `quality` of the rig profile.
@@ -104,7 +104,7 @@ def find_image_board(
     if problem is not None:
         return problem
 
-    # The poses of a board that was followed are near its last ones.
+    # The poses of a tracked board are near its last ones.
     poses = [] if followed is None or last is None else [last.T_cam_board, last.T_cam_board_alternative]
     near = [T_cam_board for T_cam_board in poses if T_cam_board is not None]
     if board.has_markers:
@@ -122,7 +122,7 @@ def find_image_board(
 
 
 def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality | None = None) -> ImageBoard:
-    """Assemble an image's detection after its pose is solved.
+    """Assemble the detection in an image once its pose is solved.
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`, NaN where hidden.
@@ -133,13 +133,13 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey image at the size of the intrinsics, as far as it reaches.
+    """Crop the grey image to the size of the intrinsics, if it is larger.
 
-    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
-    than the sensor, blank beyond it, of images reconstructed from events.
+    Two harmless differences occur in recordings: a readout that ends a few lines early, and images
+    reconstructed from events with a blank margin beyond the sensor's size.
 
     Raises:
-        ProfileError: a size that cannot be used, naming both.
+        ProfileError: the sizes do not match; the message states both.
     """
     height, width = image.pixels.shape[:2]
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
@@ -171,7 +171,7 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
 def _follow(
     grey: NDArray[np.uint8], board: Board, intrinsics: Intrinsics, last: ImageBoard
 ) -> Crossings | None:
-    """Fit the corners from their places in the previous image; None unless all of the board is there.
+    """Fit the corners from their positions in the previous image; None unless the board is complete.
 
     A board that moved by a whole square is not mistaken for itself, as squares are missing on one side.
     """
@@ -183,7 +183,7 @@ def _follow(
         start_px = np.where(was_seen[..., None], start_px, drawn_px.reshape(start_px.shape))
     crossings = fit_crossings(grey, start_px, _FOLLOWED_SAMPLES, patches)
     if np.abs(crossings.grid_px - start_px)[was_seen].max() > _RESTING_PX:
-        # Patches that lie aside of their corners pull at them.
+        # Patches beside their corners bias the fit.
         crossings = fit_crossings(grey, crossings.grid_px, _FOLLOWED_SAMPLES, patches)
     if not crossings.is_fitted[was_seen].all():
         return None
@@ -197,10 +197,10 @@ def _follow(
 def _find_near(
     grey: NDArray[np.uint8], board: Board, last: ImageBoard | None, *, is_thorough: bool
 ) -> Crossings | None:
-    """Search near the board's last place."""
+    """Search near the board's last position."""
     if last is None:
         return None
-    # The corners' box, larger by half its size.
+    # Bounding box of the corners, enlarged by half its size.
     low, high = np.nanmin(last.corners_px, axis=0), np.nanmax(last.corners_px, axis=0)
     reach = 0.5 * (high - low).max() + 8
     u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
@@ -219,7 +219,7 @@ def _solve(
     intrinsics: Intrinsics,
     near: Sequence[Array] = (),
 ) -> tuple[PlanarPose | None, Crossings]:
-    """Solve for the pose; corners far from the board's image are searched again at their predicted places.
+    """Solve for the pose; search corners far from their predicted positions again.
 
     A finder puts single corners onto an artefact now and then. If they are few, they are fitted again from
     the places that the others predict; a corner whose fit fails there takes that place and no longer counts

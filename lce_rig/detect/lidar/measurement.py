@@ -27,7 +27,7 @@ _MAD = 1.4826  # standard deviation of normal noise over its median magnitude
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
 _MIN_SMEARED = 8  # minimum number of ring ends to measure a smear: a fit takes five freedoms
 _CROSSING = 0.3  # minimum share of its gaps by which a ring crosses a side, for ends that show a smear
-SIZE_PRIOR_M = 0.10  # standard deviation a priori of a plate's sides: wide, so that ring ends determine them
+SIZE_PRIOR_M = 0.10  # prior standard deviation of a plate's sides: wide, so that ring ends determine them
 SLACK_M = 0.05  # maximum distance of a measured border from the nominal one
 
 
@@ -52,7 +52,7 @@ class RingEnds(NamedTuple):
 
 
 def median(values: Array) -> float:
-    """Compute the median: on a few hundred values several times faster than `numpy.median`."""
+    """Compute the median several times faster than `numpy.median` for a few hundred values."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     ordered = np.sort(values)
     return float(ordered[low] + ordered[high]) / 2
@@ -93,7 +93,7 @@ def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool
 def _outwards(
     scan: OrderedScan, member: Indices, side: NDArray[np.int8], n: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
-    """Find the n-th return beyond each ring end, all the way round, and whether it is a few firings off."""
+    """Find the n-th return beyond each ring end, cyclically, and whether it is a few firings away."""
     ring = scan.ring[member]
     start, end = np.searchsorted(scan.ring, ring), np.searchsorted(scan.ring, ring, side="right")
     other = start + np.mod(member - start + n * side.astype(np.intp), end - start)
@@ -104,7 +104,7 @@ def _outwards(
 def measure_size(
     ends: RingEnds, uv: Array, placement: Placement, beyond_m: float
 ) -> tuple[Placement, Array, Array, Array]:
-    """Fit a rectangle of free size to the ring ends: least squares of their distance from the nearest edge.
+    """Fit a rectangle of free size to the ring ends by least squares of their distance from the nearest edge.
 
     An end lies half a step of the ring inside the edge on average, and half a light spot outside
     (`beyond_m`); both along the edge's normal. A weak prior holds a side that no end shows.
@@ -112,7 +112,7 @@ def measure_size(
     Args:
         ends: ring ends.
         uv: (M, 2) of the plane view, m.
-        placement: of the rectangle with the nominal size.
+        placement: placement of the rectangle with the nominal size.
         beyond_m: how far the light spot reaches over an edge.
 
     Returns:
@@ -173,7 +173,7 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
     Args:
         ends: ring ends.
         side: (E,) nearest side of the fitted rectangle.
-        residual_m, step_m: of them, by `measure_size`.
+        residual_m, step_m: residual and step of the ring ends, by `measure_size`.
     """
     smear_m = np.zeros(len(side))
     is_telling = ends.is_border & (step_m > _CROSSING * np.linalg.norm(ends.gap, axis=1))
@@ -182,7 +182,7 @@ def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Arra
         if n < _MIN_SMEARED:
             continue
         spread_m = float(np.percentile(np.abs(residual_m[is_telling & among]), 75)) / _QUARTILE
-        # Ends are uniform over a step without noise. The fit takes five freedoms of all of them.
+        # Without noise, ends are uniformly distributed over a step. The fit uses five degrees of freedom.
         sharp_m = 0.375 * median(step_m[is_telling & among]) / _QUARTILE
         excess_m = float(np.sqrt(max(spread_m**2 - sharp_m**2, 0.0) * n / (n - 5.0)))
         if excess_m > EDGE_TOLERANCE_M:
@@ -201,7 +201,7 @@ Distance = TypeVar("Distance", float, Array)
 
 @dataclass(frozen=True)
 class Beam:
-    """The light spot of a LiDAR, a VLP-16's by default: half of it reaches over an edge of the board.
+    """Footprint of a LiDAR beam, a VLP-16's by default; half of it extends over the board's edge.
 
     Attributes:
         aperture_m: width of the beam at the sensor's exit.
@@ -214,11 +214,11 @@ class Beam:
     upright_rad: float | None = None
 
     def half_width_m(self, distance_m: Distance) -> Distance:
-        """Compute half the width of the spot at a distance, or at each of several."""
+        """Compute half the beam's width at one or several distances."""
         return (self.aperture_m + self.divergence_rad * distance_m) / 2
 
     def widths_m(self, distance_m: float | Array) -> Array:
-        """Compute the spot's width and height (2,) at a distance, or (K, 2) at several (K, 1)."""
+        """Compute the beam's width and height (2,) at a distance, or (K, 2) at several (K, 1)."""
         upright_rad = self.divergence_rad if self.upright_rad is None else self.upright_rad
         return self.aperture_m + np.array([self.divergence_rad, upright_rad]) * distance_m
 
@@ -233,7 +233,7 @@ def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple
     Args:
         points: (N, 3) m, frame lidar.
         start: (4,) plane as (n, d).
-        distance_m: of the plate's middle.
+        distance_m: distance of the plate's middle.
 
     Returns:
         (4,) plane as (n, d), n towards the LiDAR, and a robust standard deviation of the returns from it, m.
@@ -266,7 +266,7 @@ def refine(
     *,
     may_be_hidden: bool = False,
 ) -> tuple[PlaneView, Placement] | None:
-    """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
+    """Fit the plane to single returns inside the outline, and the outline to the beams around it.
 
     Args:
         scan: all returns.
@@ -281,7 +281,7 @@ def refine(
         The beams about the plate and the outline among them, with its error; None if too few returns lie
         on the plane inside the outline, or too many beyond it.
     """
-    # Returns around it on the same plane disprove a plate.
+    # Returns around it on the same plane show that it is not a plate.
     radius_m = float(np.hypot(*placement.half_m)) + 0.20
     tolerance_m = 4.0 * scan.sigma_m + 0.01
     near = beams_about(scan, centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m], 1.3 * radius_m)
@@ -310,14 +310,14 @@ def refine(
 def build_board(
     scan: OrderedScan, source: Scan, board: Board, view: PlaneView, placement: Placement, beam: Beam
 ) -> LidarBoard | None:
-    """Collect the returns inside the outline, keep the ring ends that are the board's own, and sum up.
+    """Collect the returns inside the outline, keep ring ends on the board's border, and measure the board.
 
     Args:
         scan: all returns, ordered.
         source: the scan they come from.
         board: nominal size.
         view: beams about the board.
-        placement: of the nominal rectangle.
+        placement: placement of the nominal rectangle.
         beam: light spot of the LiDAR.
 
     Returns:
@@ -326,7 +326,7 @@ def build_board(
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
     away = placement.distance_m(view.uv)
-    # A slightly larger plate is measured at its full size, not cut to the nominal one.
+    # Measure a slightly larger plate at its full size, not truncated to the nominal one.
     ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
     fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
     away = fitted.distance_m(view.uv)
@@ -346,7 +346,7 @@ def build_board(
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     rms_m = float(np.sqrt(np.mean(height**2)))
-    # The effective size of the light spot is unknown.
+    # The effective beam width is unknown.
     size_m, sigma_m = 2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m)
     quality = LidarQuality(
         width_m=float(size_m[0]),

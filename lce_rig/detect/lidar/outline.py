@@ -1,4 +1,4 @@
-"""Fit a rectangle to rays about a plate, by the likelihood of returns on the plate and beside it.
+"""Fit a rectangle to rays near a plate, by the likelihood of returns on the plate and beside it.
 
 A ray that meets the plate's plane at u returns from the plate with the probability
 
@@ -22,15 +22,15 @@ from lce_rig.detect.lidar.segments import Indices
 from lce_rig.detect.lidar.template import Placement
 
 N_ANGLES = 9
-# Share of rays on the wrong side of the border whatever its place; at 0 a single one would decide.
+# Fraction of rays on the wrong side of any border; with 0, a single ray would decide.
 _OUTLIERS = 0.02
 # Distance from the border beyond which rays do not locate it, m.
 _BAND_M = 0.10
-# Blurs of the first rounds, which catch a start that is off; wider ones for a plate that is only about there.
+# Blurs of the first rounds, m, which converge from an inaccurate start; wider ones for a rough start.
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
-# Maximum share of rays that contradict a clear plate's placement.
+# Maximum fraction of rays that contradict the placement of a clear plate.
 _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
@@ -41,7 +41,7 @@ _OFFSETS_M, _LEAST_SIGMA_M = np.linspace(-0.05, 0.05, 41), 0.001
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays that pierce a plate's plane, M of them.
+    """M rays that intersect a plate's plane.
 
     Attributes:
         uv: (M, 2) points of intersection with the plane, m.
@@ -71,9 +71,9 @@ class Outline(NamedTuple):
 
 
 def thin(n: int, most: int) -> Indices:
-    """Choose about `most` of n returns at random, the same ones each time, or all of fewer.
+    """Choose about `most` of n returns at random, with a fixed seed; all if there are fewer.
 
-    Even steps would pick a few of a LiDAR's lines, which recur in order and have the same errors.
+    Regular steps would select only a few of a LiDAR's lines, which recur in order and share errors.
     """
     if n <= most:
         return np.arange(n)
@@ -87,7 +87,7 @@ def fit_outline(
     growth_m: tuple[Array, float],
     annealed_m: tuple[float, ...] = _ANNEALED_M,
 ) -> Outline | None:
-    """Maximise (1) over place, turn and growth by Fisher scoring.
+    """Maximise (1) over position, rotation and growth by Fisher scoring.
 
     Args:
         rays: about the plate.
@@ -134,7 +134,7 @@ def fit_outline(
 
 
 def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
-    """Fit the rectangle from all angles about the origin and keep the two best placements, best first.
+    """Fit the rectangle from all angles about the origin; return the two best placements, best first.
 
     `error_m` is the share of rays that contradict a placement, per return on the plate.
 
@@ -149,7 +149,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
 
 
 def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
-    """Find the middle (2,) of the parts wider than half the plate's short side, m: a stand is narrower.
+    """Find the centre (2,) of the parts wider than half the plate's short side, m: a stand is narrower.
 
     The middle of a patch lies towards the stand that its plate merges with.
     """
@@ -167,7 +167,7 @@ def _middle_of_wide(rays: Rays, half_m: tuple[float, float]) -> Array:
 def _from_all_angles(
     rays: Rays, half_m: tuple[float, float], middle: Array, annealed_m: tuple[float, ...]
 ) -> list[Placement]:
-    """Fit the rectangle from all angles about a point (2,), best first; `annealed_m` as of `fit_outline`."""
+    """Fit the rectangle from all angles about a point (2,), best first; `annealed_m` as in `fit_outline`."""
     radius_m = 1.25 * float(np.hypot(*half_m))
     about = rays.select(((rays.uv - middle) ** 2).sum(axis=1) < radius_m**2)
     few = about.select(thin(len(about.uv), _FEW_RAYS))
@@ -189,12 +189,12 @@ def _from_all_angles(
 
 
 def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Array:
-    """Measure how far each side's border is smeared, m: its blur beyond that of the beam.
+    """Measure the blur of each side's border beyond that of the beam, m.
 
     Args:
         rays: about the plate.
         outline: fitted to them.
-        blur_m: as of `fit_outline`.
+        blur_m: as in `fit_outline`.
 
     Returns:
         (4,) of the right, left, top and bottom side.
@@ -231,7 +231,7 @@ def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
 
 
 class Strips(NamedTuple):
-    """Short pieces of the border, each measured on its own: K of them.
+    """K short pieces of the border, each measured separately.
 
     Attributes:
         uv: (K, 2) their middles at the end of the plate's returns, m.
@@ -249,12 +249,12 @@ class Strips(NamedTuple):
 
 
 def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array], smears_m: Array) -> Strips:
-    """Measure where each piece of the border lies, by the mean of its shift outwards under (1).
+    """Measure the position of each piece of the border: the mean outward shift under (1).
 
     Args:
         rays: about the plate.
         outline: fitted to them.
-        blur_m: as of `fit_outline`.
+        blur_m: as in `fit_outline`.
         smears_m: (4,) of the sides' borders, beyond that blur.
     """
     from scipy.special import ndtr
@@ -273,7 +273,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
-            # Without a ray near the border, it may lie anywhere between the rays on its two sides.
+            # Without rays near the border, it may lie anywhere between the rays on its two sides.
             p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr((_OFFSETS_M[:, None] - s) / blur)
             log_p = np.log(np.where(is_on, p, 1 - p))
             total = np.stack([np.bincount(strip, row, n_strips) for row in log_p])

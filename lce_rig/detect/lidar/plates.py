@@ -58,7 +58,7 @@ class Plates:
 def propose_plates(
     scan: OrderedScan, segments: Segments, board: Board, is_any_size: bool = False
 ) -> tuple[Plates, Array]:
-    """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
+    """Grow plates from pairs of neighbouring segments; keep distinct ones of plausible size.
 
     Each pair of parallel segments on neighbouring rings spans a plane. A plane takes all segments in reach
     that lie in it and is fitted again to their sums, a few times over, for all planes at once.
@@ -90,12 +90,12 @@ def propose_plates(
     for _ in range(2 * N_ROUNDS if is_blurred.any() else N_ROUNDS):
         row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
         plates = _fit(row, column, segments, sums)
-        # The same members give identical sums.
+        # Plates with the same members have identical sums.
         is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
         is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
         is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 2.0 * diagonal_m)
     if not is_any_size:
-        # Find which plates (K,) can be the board, part of which may be hidden or outside the rings.
+        # Find which plates (K,) can be the board, which may be partly hidden or outside the rings.
         long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
         ratio = plates.size_m / [long_m, short_m]
         is_kept &= np.asarray(
@@ -119,7 +119,7 @@ def propose_plates(
 def _facing_planes(
     plates: Plates, segments: Segments, first: Indices, second: Indices, blur_m: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Lay a plane (K, 4) through each pair's line, square to the beam, for pairs (K,) lost in noise.
+    """Place a plane (K, 4) through each pair's line, perpendicular to the beam, for pairs lost in noise.
 
     Where the noise is as large as the distance between two rings, their plane is arbitrary; this one is near
     enough to collect the rings beyond them.
@@ -144,7 +144,8 @@ def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tup
     is_seed &= np.abs(along_beam) < np.sin(MAX_INCIDENCE_RAD) * distance
     seed = np.flatnonzero(is_seed)
     ring, centre, direction = segments.ring[seed], segments.centre[seed], segments.direction[seed]
-    # Few pairs are on neighbouring rings: everything else is computed for them only. Segments come by ring.
+    # Only few pairs are on neighbouring rings: compute everything else for these. Segments are sorted by
+    # ring.
     begin, end = np.searchsorted(ring, ring + 1), np.searchsorted(ring, ring + 1, side="right")
     first = np.repeat(np.arange(len(ring)), end - begin)
     second = np.arange(len(first)) + (begin - np.cumsum(end - begin) + (end - begin))[first]
@@ -161,10 +162,10 @@ def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tup
 
 
 def _spread_out(centres: Array, cell_m: float) -> Indices:
-    """Choose MAX_PAIRS of pairs at centres (P, 3), best first, so that no place crowds out the others.
+    """Choose MAX_PAIRS of the pairs at centres (P, 3), best first but distributed over the scan.
 
-    Dense rings lay hundreds of pairs on every wall and floor, all of which grow to the same few planes: each
-    cell of space gives its best pair before any gives its second.
+    Dense rings place hundreds of pairs on every wall and floor, and all of them grow to the same few planes.
+    Therefore each cell of space contributes its best pair before any cell contributes its second.
     """
     cell = np.unique(np.floor(centres / cell_m), axis=0, return_inverse=True)[1].ravel()
     order = np.argsort(cell, kind="stable")
@@ -206,7 +207,7 @@ def fit_planes(sums: Array) -> tuple[Array, Array, Array]:
 def _members(
     plates: Plates, segments: Segments, reach_m: float, tolerance_m: float
 ) -> tuple[Indices, Indices]:
-    """List which segments lie in which plane, within reach of its centre: (plate, segment), rising."""
+    """List the segments in each plane, within reach of its centre: (plate, segment), ascending."""
     row, column = _within_reach(plates.centre, segments.centre, reach_m)
     normal = plates.plane[:, :3]
     offset = np.einsum("ij,ij->i", normal[row], segments.centre[column]) + plates.plane[row, 3]
@@ -217,12 +218,12 @@ def _members(
     variance = np.einsum("ij,ij->i", outer[row], scatter[column])
     is_member = offset * offset + variance < tolerance_m**2
     row, column = row[is_member], column[is_member]
-    # Number the plates that still have members without gaps.
+    # Renumber the plates that still have members.
     return np.cumsum(np.diff(row, prepend=row[:1]) != 0), column
 
 
 def _within_reach(centres: Array, others: Array, reach_m: float) -> tuple[Indices, Indices]:
-    """List the pairs (row, column) of points closer than the reach, by blocks that fit the cache."""
+    """List the pairs (row, column) of points closer than the reach, in blocks that fit the cache."""
     half_squared = np.einsum("ij,ij->i", others, others) / 2
     limit = (reach_m**2 - np.einsum("ij,ij->i", centres, centres)) / 2
     rows, columns = [], []
@@ -236,16 +237,16 @@ def _within_reach(centres: Array, others: Array, reach_m: float) -> tuple[Indice
 
 
 def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
-    """Find which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
+    """Check which planes (K,) have an incidence below the limit; d = distance of the plane."""
     distance = np.linalg.norm(plates.centre, axis=1)
     return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
 
 
 def _different(plates: Plates, candidates: Indices, board: Board) -> Indices:
-    """Choose the most board-like plate of each place and orientation, the best first."""
+    """Choose the most board-like plate at each position and orientation, best first."""
     long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
     misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
-    # Few rings leave the size open; many returns on a wrong size exclude the board.
+    # Few rings leave the size undetermined; many returns on a wrong size exclude the board.
     rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
     rank = rank[: 20 * MAX_PLATES]
     centre, normal = plates.centre[rank], plates.plane[rank, :3]
@@ -265,7 +266,7 @@ def _different(plates: Plates, candidates: Indices, board: Board) -> Indices:
 def screen_plates(
     plates: Plates, ends: Array, board: Board, limit_m: float, *, on_stand: bool = False
 ) -> list[tuple[Array, Array, Placement]]:
-    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first.
+    """Register the outline with the ends of each plate's segments; keep the plates that fit, best first.
 
     Args:
         plates: K of them.

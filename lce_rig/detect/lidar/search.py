@@ -30,10 +30,10 @@ from lce_rig.detect.lidar.template import (
     plane_axes,
 )
 
-# Share of returns beyond the outline, in the board's plane, from which something touches the board.
+# Fraction of returns beyond the outline, in the board's plane, above which something touches the board.
 TOUCHING_SHARE = 0.10
 SCATTER_M = 0.02  # scatter added to the LiDAR's noise in the search for plates to name
-# Maximum sum of |log| of the ratios of long and short side for a plate to be named.
+# Maximum sum of |log| of the ratios of long and short side for a plate to be reported.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
@@ -59,7 +59,7 @@ class Limits:
     beam: Beam = field(default_factory=Beam)
 
     def widened(self, sigma_m: float) -> "Limits":
-        """Allow for the noise that a scan shows."""
+        """Widen the limits by the scan's noise."""
         template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
         return replace(self, template_m=template_m, rms_m=self.rms_m + 1.5 * sigma_m)
 
@@ -68,7 +68,7 @@ STANDARD = Limits()
 
 
 def too_thick(heights_m: Array, limit_m: float) -> Refusal:
-    """Refuse a board whose returns scatter about its plane by more than the LiDAR's noise explains.
+    """Refuse a board whose returns scatter more about its plane than the LiDAR's noise explains.
 
     Args:
         heights_m: (N,) of the returns over the plane.
@@ -78,7 +78,7 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
 
 
 def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
-    """Refuse a plate whose outline is not the board's: it is warped, something touches it, parts are hidden.
+    """Refuse a plate with another outline than the board's: warped, touched by an object, or partly hidden.
 
     Args:
         view: beams about the plate.
@@ -103,7 +103,7 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
 
 
 def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
-    """Refuse a scan in which no plate is the board, naming the most similar one.
+    """Refuse a scan without the board, and describe the most similar plate.
 
     The search is repeated for plates of any size, with more scatter than the LiDAR's noise.
 
@@ -122,13 +122,13 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
 
 
 def nearest_plate(plates: Plates, misfit: Array, board: Board, limits: Limits) -> Refusal:
-    """Refuse a scan by the plate whose size is nearest to the board's, or because none is near to it.
+    """Refuse a scan: name the plate nearest in size to the board, or report that none is near.
 
     Args:
         plates: K of them.
         misfit: (K,) sum of |log| of the ratios of long and short side.
         board: the board searched for.
-        limits: of the search.
+        limits: limits of the search.
     """
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
@@ -145,12 +145,12 @@ def other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
 
 
 MAX_CANDIDATES = 4
-# Limits of a clear plate: minimum rings, maximum share of other returns in its plane.
+# Limits of a clear plate: minimum rings, maximum fraction of other returns in its plane.
 CLEAR_RINGS = 6
 CLEAR_SHARE = 0.05
-# Share of returns beyond the outline from which, beside a clear board, a plate is a patch of a wall.
+# Fraction of returns beyond the outline above which, beside a clear board, a plate is part of a wall.
 PATCH_SHARE = 0.20
-# Incidence beyond which dark squares may return nothing, and minimum share of the beams lost there.
+# Incidence above which dark squares may return nothing, and minimum fraction of beams lost there.
 GRAZING_RAD = np.radians(35.0)
 LOST_SHARE = 0.10
 
@@ -261,14 +261,14 @@ def _past_dark_squares(
     limits: Limits,
     max_beyond: float,
 ) -> tuple[PlaneView, Placement] | None:
-    """Register the outline of a board whose dark squares, grazed by beams, return nothing or too far off.
+    """Register the outline of a board whose dark squares, at grazing incidence, return nothing or too far.
 
     Such beams do not locate the outline; the others must fit it as without noise. Of boards at 42 to
     66 deg before a VLP-16 and a VLP-32C, 12 to 41 % of the beams are lost; of walls and tables at most 9 %.
 
     Args:
         scan: all returns.
-        board, start, limits, max_beyond: as of `measure_plate`.
+        board, start, limits, max_beyond: as in `measure_plate`.
 
     Returns:
         As `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.
@@ -295,7 +295,7 @@ def distinct_boards(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 
 
 def _penalty(found: LidarBoard, board: Board) -> float:
-    """Rate a candidate in m: residual of outline and size, unobserved parts, other returns in its plane."""
+    """Score a candidate in m: residuals of outline and size, unobserved parts, other returns in its plane."""
     q = found.quality
     penalty = q.template_m + 0.03 / max(q.n_rings, 1) + 0.15 * (q.width_sigma_m + q.height_sigma_m)
     penalty += 0.05 * q.beyond_share
@@ -316,7 +316,7 @@ def look_for_board(
     T_lidar_board: Array,
     limits: Limits = STANDARD,
 ) -> LidarBoard | Refusal:
-    """Find the board about a pose predicted from an image and extrinsics, or from an earlier scan.
+    """Find the board near a pose predicted from an image and extrinsics, or from an earlier scan.
 
     The outline is registered from that pose; where this fails, the box about it is searched.
 
@@ -337,7 +337,7 @@ def look_for_board(
         return at_once
     half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + MARGIN_M
     rotation, centre = T_lidar_board[:3, :3].astype(np.float32), T_lidar_board[:3, 3].astype(np.float32)
-    # A sphere first: it is the cheaper test, and few returns pass it.
+    # Test a sphere first: it is cheaper, and few returns pass.
     away = np.ascontiguousarray(scan.points.T) - centre[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
         near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
@@ -349,7 +349,7 @@ def look_for_board(
 def board_at(
     found: list[LidarBoard] | Refusal, T_lidar_board: Array, cause: Refusal | None = None
 ) -> LidarBoard | Refusal:
-    """Choose the board at a pose (4, 4), or refuse, with the given cause or the search's."""
+    """Choose the board at a pose (4, 4), or refuse with the given reason or the search's."""
     if isinstance(found, Refusal):
         cause = cause or found
         return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
@@ -361,7 +361,7 @@ def board_at(
 def _measure_at(
     scan: Scan, board: Board, T_lidar_board: Array, limits: Limits
 ) -> LidarBoard | Refusal | None:
-    """Register and measure the outline from a pose, as `measure_plate`."""
+    """Register and measure the outline from a pose, like `measure_plate`."""
     ordered = order_scan(scan, limits.min_range_m)
     if len(ordered.index) == 0:
         return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
@@ -374,6 +374,6 @@ def _measure_at(
 
 
 def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
-    """Return whether a board is within MARGIN_M and 15 deg of a pose."""
+    """Check whether a board is within MARGIN_M and 15 deg of a pose."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
     return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > np.cos(np.radians(15.0))

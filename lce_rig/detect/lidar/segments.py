@@ -1,4 +1,4 @@
-"""A scan as rings of ordered returns, cut into straight segments that are described by their sums."""
+"""A scan as rings of ordered returns, split into straight segments described by their sums."""
 
 from dataclasses import dataclass, fields
 
@@ -20,17 +20,17 @@ RANGE_NOISE_FLOOR_M = 0.004
 
 @dataclass(frozen=True, eq=False)
 class OrderedScan:
-    """The usable returns of a scan, ring after ring, each by rising azimuth from a gap or jump onwards.
+    """The usable returns of a scan, sorted by ring and then by azimuth.
 
-    No surface is cut in two by the seam at azimuth +-pi.
+    Each ring starts at a gap or range jump, so that the seam at azimuth +-pi cuts no surface in two.
 
     Attributes:
-        index: (N,) of each return in the scan it comes from.
+        index: (N,) index of each return in the original scan.
         points: (N, 3) m, frame lidar.
         range_m: (N,).
         azimuth: (N,) atan2(y, x), rad.
         ring: (N,).
-        is_break: (N,) whether the return before it in its ring lies on another surface or too far off.
+        is_break: (N,) whether the ring's previous return lies on another surface or too far away.
         step_rad: angle between neighbouring firings of one ring.
         sigma_m: noise of a single range.
     """
@@ -47,7 +47,7 @@ class OrderedScan:
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Runs of neighbouring returns of one ring, S of them, by ring and azimuth.
+    """S runs of neighbouring returns of one ring, sorted by ring and azimuth.
 
     Attributes:
         start, end: (S,) half-open range of returns in the `OrderedScan`.
@@ -117,12 +117,12 @@ def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
 
 
 def _starts(ring: NDArray[np.int16]) -> Indices:
-    """List where each ring begins, in returns (N,) that are ordered by ring."""
+    """Return the start index of each ring in returns (N,) sorted by ring."""
     return np.append(0, np.flatnonzero(ring[1:] != ring[:-1]) + 1)
 
 
 def _since_previous(values: Floats, starts: Indices) -> Floats:
-    """Subtract from each value (N,) the one before it in its ring; from the first, the last of the ring."""
+    """Subtract the previous value of the ring from each value (N,), cyclically."""
     change = np.empty_like(values)
     change[1:] = values[1:] - values[:-1]
     change[starts] = values[starts] - values[np.append(starts[1:], len(values)) - 1]
@@ -130,7 +130,7 @@ def _since_previous(values: Floats, starts: Indices) -> Floats:
 
 
 def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Indices:
-    """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
+    """Sort each ring's returns, given in firing order, by azimuth; drop those of a second revolution.
 
     A scan of slightly more than one turn has the same directions twice, 0.1 s apart; mixed, they would split
     moving objects in two. Point clouds that are not in order of firing lose nothing.
@@ -158,12 +158,12 @@ def _azimuth_step(turn: Floats) -> float:
         return 0.0
     middle = float(np.median(forward[:: 1 + len(forward) // 1000]))
     common = forward[np.abs(forward - middle) < 0.3 * middle]
-    # Among a few returns, such as those left about a board's place, two steps may have nothing in common.
+    # Among few returns, such as those near a predicted board, two steps may have nothing in common.
     return float(np.mean(common, dtype=np.float64)) if len(common) else middle
 
 
 def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:
-    """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
+    """Estimate the range noise from second differences along the rings, 0 on planes up to curvature.
 
     The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is used, as edges and foliage spoil the rest.
     """
@@ -177,7 +177,7 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
 
 
 def cut_segments(scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf) -> Segments:
-    """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
+    """Split the rings at gaps and jumps, then at bends, and keep the straight pieces.
 
     A run with returns off its chord is cut at the farthest one, as a polyline is simplified.
 
@@ -215,7 +215,7 @@ def cut_segments(scan: OrderedScan, max_range_m: float, max_length_m: float = np
 
 
 def _unroll(start: Indices, end: Indices) -> tuple[Indices, Indices, Indices]:
-    """Lay half-open ranges out: where each begins (S,), the range (M,) and index (M,) of each member."""
+    """Expand half-open ranges: start of each (S,), range (M,) and index (M,) of each member."""
     count = end - start
     begins = np.cumsum(count) - count
     run = np.repeat(np.arange(len(count)), count)
@@ -243,7 +243,7 @@ def _worst_from_chord(xyz: Floats, start: Indices, end: Indices) -> tuple[Indice
 
 
 def _describe(xyz: Floats, ring: NDArray[np.int16], start: Indices, end: Indices) -> Segments:
-    """Sum up the returns (3, N) of each run."""
+    """Compute the sums over the returns (3, N) of each run."""
     begins, run, member = _unroll(start, end)
     count = (end - start).astype(np.float64)
     points = xyz.take(member, axis=1)

@@ -1,4 +1,4 @@
-"""Register the board's rectangle in a plane: where the beams end, meet the plane, or pass through it."""
+"""Register the board's rectangle in a plane by beams that end, hit the plane, or pass through it."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ END, INSIDE, OUTSIDE, UNUSED = range(4)
 
 @dataclass(frozen=True, eq=False)
 class PlaneView:
-    """The beams about a plate as they pierce its plane, M of them, by ring and azimuth.
+    """M beams near a plate, intersected with its plane, sorted by ring and azimuth.
 
     Attributes:
         plane: (4,) as (n, d), n towards the LiDAR.
@@ -47,16 +47,16 @@ class PlaneView:
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
-        """Which beams return from the plane (M,)."""
+        """Whether beams return from the plane (M,)."""
         return np.abs(self.height_m) <= self.tolerance_m
 
     @property
     def is_behind(self) -> NDArray[np.bool_]:
-        """Which beams pass through the plane (M,), and not through a dark square."""
+        """Whether beams pass through the plane (M,), but not through a dark square."""
         return self.height_m < -(max(self.tolerance_m, DARK_DEPTH_M) if self.dark_m else self.tolerance_m)
 
     def pose_of(self, placement: "Placement") -> Array:
-        """Build T_lidar_board (4, 4) of a placed board; y points upwards where that is left open."""
+        """Build T_lidar_board (4, 4) of a placed board; if ambiguous, y points upwards."""
         direction = placement.axes[0]
         x = self.axes @ (-direction if direction[0] < 0 else direction)
         normal = self.plane[:3]
@@ -70,7 +70,7 @@ class Placement:
 
     Attributes:
         u_m, v_m: its centre.
-        angle_rad: of its width axis from u.
+        angle_rad: angle of its width axis from u.
         half_m: half width and half height.
         error_m: how far the beams contradict it: mean capped distance of the chords' ends from the border,
             plus the cap for each beam that contradicts it elsewhere, per chord end or beam on the plane.
@@ -93,17 +93,17 @@ class Placement:
         return np.asarray((uv - [self.u_m, self.v_m]) @ np.ascontiguousarray(self.axes.T))
 
     def distance_m(self, uv: Array) -> Array:
-        """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
+        """Compute the distance of points (..., 2) of the plane view from the border, negative inside."""
         return self.beyond_m(self.local(uv))
 
     def beyond_m(self, local: Array) -> Array:
-        """Measure the distance of points (..., 2) in the rectangle's axes from the border."""
+        """Compute the distance of points (..., 2) in the rectangle's axes from the border."""
         over = np.abs(local) - self.half_m
         return _distance_over(over[..., 0], over[..., 1])[0]
 
 
 def beams_about(scan: OrderedScan, centre: Array, radius_m: float) -> Indices:
-    """List the beams (M,) in the cone about a sphere: most are elsewhere, and need no closer look."""
+    """List the beams (M,) in the cone around a sphere; the others need no closer test."""
     distance = float(np.linalg.norm(centre))
     cosine = np.sqrt(max(0.0, 1.0 - (radius_m / max(distance, 1e-6)) ** 2))
     along = scan.points @ centre.astype(np.float32)
@@ -119,14 +119,14 @@ def view_plane(
     tolerance_m: float,
     dark_m: float = 0.0,
 ) -> PlaneView:
-    """Pierce a plane by those beams that do so within a radius of a point.
+    """Intersect a plane with the beams that hit it within a radius of a point.
 
     Args:
         points: (N, 3) m, all returns.
         among: (K,) of them that are tried.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
-        radius_m: of the disc examined.
+        radius_m: radius of the disc examined.
         tolerance_m, dark_m: as in the view.
     """
     normal, d = plane[:3], plane[3]
@@ -142,7 +142,7 @@ def view_plane(
 
 
 def plane_axes(normal: Array) -> Array:
-    """Build unit vectors (..., 3, 2) of a plane: the first level, the second upwards; right-handed with n."""
+    """Build the unit vectors (..., 3, 2) of a plane: horizontal, then upwards; right-handed with n."""
     x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
     length = np.hypot(x, y)
     is_level = length < 1e-3
@@ -156,7 +156,7 @@ def plane_axes(normal: Array) -> Array:
 
 
 def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Indices, Indices]:
-    """Find on each ring the run of returns from the plane that shares most with the placed rectangle.
+    """Find on each ring the run of returns from the plane that overlaps most with the placed rectangle.
 
     Other runs of the ring belong to other things that happen to lie in the plane.
 
@@ -188,7 +188,7 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
 
 
 def lost_share(scan: OrderedScan, view: PlaneView, placement: Placement) -> float:
-    """Compute the share of the beams between the chords' ends that do not return from the plane."""
+    """Compute the fraction of beams between the chords' ends that do not return from the plane."""
     first, last = find_chords(scan, view, placement)
     azimuth = scan.azimuth[view.member]
     turn = np.abs(np.mod(azimuth[last] - azimuth[first] + np.pi, 2 * np.pi) - np.pi)
@@ -197,7 +197,7 @@ def lost_share(scan: OrderedScan, view: PlaneView, placement: Placement) -> floa
 
 
 def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement | None:
-    """Find the placement of a rectangle, near a first guess, that the beams contradict least.
+    """Find the placement of a rectangle near a first guess that agrees best with the beams.
 
     The chords' ends should lie on the border, beams that return from the plane inside it, and beams that
     return from behind the plane outside.
@@ -232,7 +232,7 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
     inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
     outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
-    # The border lies farther out than an end that is hidden, or beyond which a dark square may lie.
+    # The border lies beyond an end that is hidden or may be followed by a dark square.
     if view.dark_m:
         kind[: len(ends)][_is_before_dark(scan, view, first, last)] = INSIDE
     if view.may_be_hidden:
@@ -253,14 +253,14 @@ def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> 
 
 
 def _is_before_dark(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Find ends (2 C,) of chords beyond which the ring goes on, but not with a beam that passes by."""
+    """Find ends (2 C,) of chords after which the ring continues, but not with a beam passing the plate."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     passes = view.is_behind[beyond] & is_next
     return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
 
 
 def _is_before_cover(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
-    """Find ends (2 C,) of chords beyond which the next beam returns from before the plane."""
+    """Find ends (2 C,) of chords followed by a return in front of the plane."""
     end, beyond, is_next = _beyond(scan, view, first, last)
     is_same = scan.ring[view.member[beyond]] == scan.ring[view.member[end]]
     return np.asarray(is_same & is_next & (view.height_m[beyond] > view.tolerance_m))
@@ -269,7 +269,7 @@ def _is_before_cover(scan: OrderedScan, view: PlaneView, first: Indices, last: I
 def _beyond(
     scan: OrderedScan, view: PlaneView, first: Indices, last: Indices
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """List the ends (2 C,) of chords, the beams of the view after them, and whether these follow at once."""
+    """List the ends (2 C,) of chords, the beams after them, and whether these follow directly."""
     end = np.concatenate([first, last])
     beyond = np.clip(end + np.repeat([-1, 1], len(first)), 0, len(view.uv) - 1)
     turn = scan.azimuth[view.member[beyond]] - scan.azimuth[view.member[end]]
@@ -278,7 +278,7 @@ def _beyond(
 
 
 def register_ends(ends: Array, board: Board) -> list[Placement]:
-    """Find for each of G plates the placement of the board's outline whose border is nearest to its ends.
+    """For each of G plates, find the board placement whose border is nearest to the plate's ends.
 
     Args:
         ends: (G, M, 2) start and end of the rings in each plate's plane, m; NaN fills the rows up.
@@ -307,7 +307,7 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
 
 
 def _distance_over(over_x: Array, over_y: Array) -> tuple[Array, Array]:
-    """Turn how far points lie over the sides, m, into signed distances and distances outside."""
+    """Convert distances of points beyond the sides, m, to signed distances and distances outside."""
     away = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
     return away + np.minimum(np.maximum(over_x, over_y), 0.0), away
 

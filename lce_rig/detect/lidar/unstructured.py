@@ -45,9 +45,9 @@ from lce_rig.detect.lidar.template import Placement, PlaneView, plane_axes, view
 
 # Cells per short side of the board: 6 cm for a plate of 0.63 m.
 _CELLS = 10.0
-# Maximum points used of an accumulated cloud, which holds millions: to find plates, and to measure one.
+# Maximum points used of an accumulated point cloud of millions: to find plates, and to measure one.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
-# Number of returns, or of rays, for a first estimate of plane and outline; all of them locate both.
+# Number of returns, or of rays, for a first estimate of plane and outline; the final one uses all.
 _ROUGH = 6_000
 _MOST_PATCHES = 8
 # Maximum sum of |log| of a patch's sides over the board's to be the board, if another patch is found.
@@ -59,12 +59,12 @@ _SURROUND_M = 0.25
 _MIN_POINTS = 60
 # Approximate error of the directions of a rosette's beams, rad.
 _DIRECTION_RAD = 7e-4
-# Share of the plate without returns from which it reaches out of the field of view.
+# Fraction of the plate without returns above which it reaches out of the field of view.
 _DARK_SHARE = 0.08
 _BEHIND_M, _FOOT_M = 0.05, 0.15
-# Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
+# Range differences of black and white squares, and of glare, reach centimetres at perpendicular incidence.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
-# Limits of another plate: share of rays that contradict the best placement, and growth of the outline.
+# Limits of another plate: fraction of rays that contradict the best placement, and growth of the outline.
 _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
@@ -72,18 +72,20 @@ _TOUCHED_SHARE = 0.2
 # Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
-# Maximum blur of a still board's border, m (5 mm at most on recordings); a wider border counts by its width.
+# Maximum blur of a still board's border, m (at most 5 mm on recordings); a wider border is weighted by its
+# width.
 _MOST_SMEAR_M = 0.008
 # Parts, in order of time, to detect that a plate moved, and the limit of their chi2 (6 freedoms, p = 1e-4).
 _N_PARTS, _MOVED_CHI2 = 4, 27.9
-# Minimum number of located places on upright and on level edges, and of means on the plate, to fix its pose.
+# Minimum number of located places on vertical and on horizontal edges, and of means on the plate, to fix its
+# pose.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
 
 
 def find_unstructured_boards(
     scan: Scan, board: Board, limits: Limits = STANDARD
 ) -> list[LidarBoard] | Refusal:
-    """Find the plates of the board's size in a point cloud without rings, best first.
+    """Find plates of the board's size in a point cloud without rings, best first.
 
     Args:
         scan: one scan, or several of a still board together.
@@ -126,7 +128,7 @@ def _too_few(n_points: int, distance_m: float, min_points: int = _MIN_POINTS) ->
 def look_for_unstructured_board(
     scan: Scan, board: Board, T_lidar_board: Array, limits: Limits = STANDARD
 ) -> LidarBoard | Refusal:
-    """Find the board about a predicted pose (4, 4), such as an image and extrinsics give.
+    """Find the board near a predicted pose (4, 4), from an image and extrinsics for example.
 
     The plates are searched in the cone of rays about the board.
     """
@@ -136,7 +138,7 @@ def look_for_unstructured_board(
 
 
 def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[np.bool_]:
-    """Find the rays (N,) that pass the board's middle closely enough to locate its border."""
+    """Find the rays (N,) that pass the board's centre closely enough to locate its border."""
     reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + _SURROUND_M
     squared_cosine = 1.0 / (1.0 + (reach_m / np.linalg.norm(centre)) ** 2)
     along = points @ (centre / np.linalg.norm(centre)).astype(points.dtype)
@@ -179,15 +181,15 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     count = np.bincount(label)
     large = np.flatnonzero(count >= 8)
     large = large[np.argsort(-count[large], kind="stable")]
-    # Each cell has the same weight: a rosette is densest in its middle.
+    # Each cell has the same weight: a rosette is densest in its centre.
     alike = sums / sums[:, :1]
     totals = [np.bincount(label, column, n_patches)[large] for column in alike.T]
     return Plates.of(np.array(totals, dtype=np.float64).T, np.zeros(len(large), dtype=np.intp))
 
 
 def _sum_cells(points: Array, cell_m: float) -> Array:
-    """Sum 1, p and p p^T of the points in each cell of space: (V, 13)."""
-    # Columns, each in one piece of memory, take half the time of rows.
+    """Sum 1, p and p p^T of the points in each voxel: (V, 13)."""
+    # Contiguous columns take half the time of rows.
     columns = np.ascontiguousarray(points.T)
     key = np.zeros(len(points), dtype=np.int64)
     for column in columns:
@@ -218,7 +220,7 @@ class _View(PlaneView):
 
     @classmethod
     def of(cls, returns: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
-        """Pierce a plane near a point by the rays of returns (N, 4)."""
+        """Intersect a plane near a point with the rays of returns (N, 4)."""
         among = np.arange(len(returns))
         view = view_plane(returns[:, :3], among, plane, centre, np.inf, tolerance_m)
         return cls(**vars(view), returns=returns[view.member], beam=limits.beam)
@@ -226,8 +228,8 @@ class _View(PlaneView):
     def beam_parts_m(self, normals: Array, uv: Array) -> Array:
         """Split half the beam's width on the plane along unit normals (K, 2) at uv (K, 2) by its two axes.
 
-        The spot is an ellipse across the ray, of half widths a and b; on the plane it is drawn out by the
-        plane's turn. Along a normal m of the plane with normal n it reaches
+        The beam's cross-section is an ellipse of half widths a and b; on an oblique plane its footprint is
+        elongated. Along a normal m of the plane with normal n it reaches
 
             h = |diag(a, b) [level, up]^T s|,    s = m - (m . ray) / (n . ray) n                         (1)
 
@@ -258,7 +260,7 @@ class _View(PlaneView):
         return expected, float(expected.max()) / 2 + 0.005
 
     def rays(self, half_m: tuple[float, float], placement: Placement | None = None) -> Rays:
-        """Sort rays into those that return from the plate and those that passed beside it.
+        """Separate rays that return from the plate from those that pass beside it.
 
         Rays that return from before the plane, or just behind it where echoes of plate and background blend,
         are left out, except that a stand or a touching object ends the plate. Places without any return count
@@ -283,7 +285,7 @@ class _View(PlaneView):
 
 
 def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array, float]:
-    """List cells (K, 2) on and about a placement that no ray pierced, nor their neighbours; also their size.
+    """List cells (K, 2) in and near a placement without rays, themselves and neighbours; and their size.
 
     Cells are so large that four returns are due in each.
     """
@@ -303,7 +305,7 @@ def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array,
 def measure_unstructured(
     returns: Array, board: Board, plane: Array, centre: Array, limits: Limits
 ) -> LidarBoard | Refusal:
-    """Fit plane and outline to the rays about a patch, measure the board and check it against the limits.
+    """Fit plane and outline to the rays near a patch, measure the board and check it against the limits.
 
     Args:
         returns: (N, 4) x, y, z, intensity.
@@ -350,7 +352,7 @@ def measure_unstructured(
 
 
 def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refusal:
-    """Check the returns inside a fitted outline and sum up the board."""
+    """Check the returns inside a fitted outline and compute the board's figures."""
     placement = outline.placement
     distance_m = float(np.linalg.norm(view.origin))
     away = placement.distance_m(view.uv)
@@ -382,14 +384,14 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         if moved_m is not None:
             return LIDAR_MOVED.refusal(distance_m=distance_m, moved_m=moved_m)
         strips = measure_strips(rays, outline, view.blur_m, smears_m)
-    # A strip off its neighbours is touched or hidden by something.
+    # Something touches or hides a strip that deviates from its neighbours.
     strip_smear_m = smears_m[strips.side]
     is_good = (strips.sigma_m < np.hypot(_STRIP_SIGMA_M, strip_smear_m)) & (
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
     is_touched, behind_m, echo = _look_beyond(view, strips, placement)
     is_good &= ~is_touched
-    # Upright edges locate the plate along its width, the others along its height: both are needed.
+    # Vertical edges locate the plate along its width, horizontal ones along its height: both are needed.
     is_upright = np.abs(strips.outwards[is_good] @ placement.axes[0]) > np.sqrt(0.5)
     n_upright, n_level = int(np.count_nonzero(is_upright)), int(np.count_nonzero(~is_upright))
     if min(n_upright, n_level) < _MIN_STRIPS:
@@ -422,7 +424,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     beam_m = view.beam_parts_m(strips.outwards, strips.uv)
     inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
-    # The errors of a side's strips may be the same, so together they count as one place of their width.
+    # The errors of a side's strips may be equal, so together they count as one place of their width.
     n_of_side = np.bincount(strips.side[is_good], minlength=4)[strips.side[is_good]]
     edge_sigma_m = strip_smear_m[is_good] * np.sqrt(n_of_side)
     return LidarBoard(
@@ -444,7 +446,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
 
 
 def _beside(rays: Rays, strips: Strips, is_touched: NDArray[np.bool_]) -> Rays:
-    """Leave out the rays to which a strip of the border (K,) that is touched is the nearest."""
+    """Exclude the rays nearest to a border strip (K,) that something touches."""
     from scipy.spatial import cKDTree
 
     if not is_touched.any():
@@ -453,12 +455,12 @@ def _beside(rays: Rays, strips: Strips, is_touched: NDArray[np.bool_]) -> Rays:
 
 
 def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | None:
-    """Measure how far the plate moved in its plane while points were accumulated, m; None if it did not.
+    """Measure the plate's motion in its plane during accumulation, m; None if it did not move.
 
     Points come in order of time: the outline is fitted to the rays of each quarter.
 
     Args:
-        view: of the plate.
+        view: the plate's plane and beams.
         outline: fitted to all rays.
         smears_m: (4,) of its sides.
     """

@@ -40,7 +40,7 @@ def open_events(
         path: an AEDAT4, Prophesee .raw or HDF5 file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
-        topic: of a bag; None takes the only one with events.
+        topic: topic of a bag; None takes the only one with events.
 
     Raises:
         SourceError: nothing is there, nothing that can be read, no events, or those of a camera of another
@@ -119,7 +119,7 @@ class EventCameraFile:
             self.notes += [note for note in notes if note not in self.notes]
 
     def _open_frames(self, file: Aedat4File) -> tuple[Aedat4File, int, str] | None:
-        """Find the frames of an AEDAT4 file, the number of their stream and their channel; None without."""
+        """Find the images of an AEDAT4 file: their stream number and channel; None without images."""
         number = file.first_stream("frame")
         if number is None:
             return None
@@ -132,7 +132,7 @@ class EventCameraFile:
             self.notes.append(f"{self.path.name}: {note}")
             return None
         self.streams.add(Stream(self._camera, channel, "images"))
-        # Those of a file full of events are fewer.
+        # A file with many events has fewer images.
         self.n_samples = max(1, self.path.stat().st_size // first.pixels.nbytes)
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:

@@ -1,4 +1,4 @@
-"""iniVation's AEDAT4 files: events and frames, read by aedat, which goes as far as a torn file does.
+"""iniVation's AEDAT4 files: events and images, read by aedat, up to the end of a torn file.
 
 References:
     https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html
@@ -46,7 +46,7 @@ class Aedat4Frame(NamedTuple):
 
 @contextmanager
 def _panics() -> Iterator[None]:
-    """Turn aedat's panic on damaged data, which does not derive from Exception, into a ValueError."""
+    """Convert aedat's panic on damaged data, which is not an Exception, to a ValueError."""
     try:
         yield
     except BaseException as error:
@@ -87,7 +87,7 @@ class Aedat4File:
         self.serial = source[1].decode() if source else ""
 
     def first_stream(self, kind: str) -> int | None:
-        """Return the number of the first stream of a type, "events" or "frame"; other streams are noted."""
+        """Return the number of the first stream of a type, "events" or "frame"; note other streams."""
         numbers = [number for number, stream in self.streams.items() if stream["type"] == kind]
         if len(numbers) > 1:
             self.notes.append(f"{self.path.name}: {kind} of stream {numbers[0]}, the first of {len(numbers)}")

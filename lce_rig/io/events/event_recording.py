@@ -1,4 +1,4 @@
-"""A recording of events, checked and sorted by time, with a count of faults; the interface of its readers."""
+"""A recording of events, checked and sorted by time, with counted faults; the interface of its readers."""
 
 import re
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ MAX_EVENT_PIXELS = 1 << 22
 REORDER_NS = 20_000_000
 # Larger jumps count as a clock change, not as damaged timestamps, ns.
 _CLOCK_SET_NS = 1_000_000_000
-# More events off the sensor than this are another sensor's; fewer are damage.
+# Maximum fraction of events outside the sensor that counts as damage; more are another sensor's.
 _MAX_OFF_SHARE = 0.01
 _HOST_STRETCHES = 200
 # September 2001: clocks that count from 1970 read more, those that count from their start less.
@@ -31,7 +31,7 @@ _SINCE_1970_NS = 10**18
 
 
 class NoEventsError(SourceError):
-    """A recording that could hold events and holds none."""
+    """A valid recording without any events."""
 
 
 NO_EVENTS = EventColumns(
@@ -53,7 +53,7 @@ class EventStream:
     serial: str = ""
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
-        """Yield the events from the beginning, as they lie in the file; may be called again and again.
+        """Yield the events from the beginning, in file order; may be called repeatedly.
 
         Raises:
             SourceError: nothing more can be read for a reason the user can repair.
@@ -62,8 +62,8 @@ class EventStream:
 
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:
-    """Read a resolution (px) from a file's text; None if no sensor has it."""
-    # No sensor has more than five digits of pixels; int() takes quadratic time over the digits.
+    """Read a resolution (px) from a file's text; None if implausible."""
+    # No sensor has more than five digits of pixels, and int() takes quadratic time.
     if not all(re.fullmatch("[0-9]{1,5}", text) for text in (width, height)):
         return None
     size = int(width), int(height)
@@ -71,7 +71,7 @@ def parse_size(width: str, height: str) -> tuple[int, int] | None:
 
 
 def to_ns(times_us: NDArray[Any], offset_us: int = 0) -> NDArray[np.int64]:
-    """Convert whole microseconds; times beyond any clock become MAX_TIME_NS, which `in_time_order` skips.
+    """Convert whole microseconds; implausible times become MAX_TIME_NS, which `in_time_order` skips.
 
     Args:
         times_us: (N,) integers of any type, or finite numbers.
@@ -99,11 +99,11 @@ class EventRecording:
     def __init__(
         self, path: Path, stream: EventStream, sensor: str, resolution_px: tuple[int, int] | None
     ) -> None:
-        """Check the resolution, and that there are events.
+        """Check the resolution and that the recording has events.
 
         Args:
             path: the file or folder, for messages.
-            stream: its reader.
+            stream: the stream's reader.
             sensor: name of the camera.
             resolution_px: (width, height) of the profile; None takes the file's.
 
@@ -124,7 +124,7 @@ class EventRecording:
 
     @property
     def notes(self) -> list[str]:
-        """Assumptions, repairs and losses so far, in words; grows while the recording is read."""
+        """Assumptions, repairs and losses so far, as text; grows while the recording is read."""
         lines = self._assumed + worded(self._losses)
         return self._stream.notes + [f"{self.path.name}: {line}" for line in lines]
 
@@ -143,7 +143,7 @@ class EventRecording:
         return self.start_ns, max(int(stretch.t_ns[-1]) for stretch in self)
 
     def tie_to_host(self) -> None:
-        """Move timestamps that count from the sensor's start to the host's clock, if arrivals are known.
+        """Convert timestamps relative to the sensor's start to the host's clock, if arrivals are known.
 
         The shift is the least difference among the first packets: the one that waited least.
         """
@@ -221,7 +221,7 @@ def _size(resolution_px: tuple[int, int]) -> str:
 
 
 def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses) -> Iterator[EventColumns]:
-    """Yield stretches whose timestamps never decrease, within and from one to the next.
+    """Yield batches with ascending timestamps, within and between batches.
 
     Timestamps mixed within 20 ms are sorted; stray ones are skipped.
     Events are held back until the next stretch shows that nothing earlier follows.
@@ -252,7 +252,7 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
             continue
         late = np.maximum.accumulate(held.t_ns) - held.t_ns > REORDER_NS
         early = held.t_ns - np.minimum.accumulate(held.t_ns[::-1])[::-1] > REORDER_NS
-        # One timestamp too far ahead makes all that follow look late, and the reverse: the fewer are stray.
+        # A single early timestamp makes all that follow look late, and vice versa: the minority is stray.
         stray = min(late, early, key=np.count_nonzero)
         if stray.any():
             where = f"after {held.t_ns[max(int(np.argmax(stray)) - 1, 0)] * 1e-9:.3f} s"

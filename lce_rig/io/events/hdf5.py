@@ -144,7 +144,7 @@ def _of_other_file(group: Any, name: str) -> SourceError:
 
 
 def _require_filter(table: Any) -> None:
-    """Raise SourceError for a table compressed by Prophesee's filter if that is not installed."""
+    """Raise SourceError for a table compressed by Prophesee's filter if the filter is missing."""
     import h5py
 
     settings = table.id.get_create_plist()

@@ -29,7 +29,7 @@ _BLOCK_BYTES = 1 << 18
 
 @dataclass
 class WrappingCounter:
-    """Follows the high part of a camera's clock, which wraps, from block to block.
+    """Tracks the high part of a camera's clock, which wraps around, from block to block.
 
     Attributes:
         n_bits: the counter wraps at 2**n_bits.
@@ -42,10 +42,11 @@ class WrappingCounter:
     last: int | None = None
 
     def unwrap(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Add the wraps to the next values (N,) of the counter."""
+        """Return the next counter values (N,) with wraps added."""
         if not len(values):
             return values
-        # A single word that leaps out of a steady row would add a wrap for good: the one before replaces it.
+        # A single outlier in an ascending series would add a wrap permanently: the previous value replaces
+        # it.
         before, word, after = values[:-2], values[1:-1], values[2:]
         is_steady = (after >= before) & (after - before <= self.max_step_back)
         is_odd = is_steady & (np.abs(word - before) > self.max_step_back)
@@ -95,12 +96,12 @@ class WordDecoder:
         self.clock = WrappingCounter(12, 10)
         self._layout = layout
         self._time = self._place = np.empty(0, np.uint16)
-        # By code: the bits of a vector, 0 of other words.
+        # Number of bits of a vector by code, 0 for other words.
         self._n_bits = np.zeros(16, np.int64)
         self._n_bits[list(layout.vectors)] = list(layout.vectors.values())
 
     def start_packet(self) -> None:
-        """Begin a packet that counts its time from zero."""
+        """Start a packet with times relative to its start."""
         layout = self._layout
         self._time = np.array([layout.time_high << 12, layout.time_low << 12], np.uint16)
         self.clock.last = 0
@@ -116,7 +117,7 @@ class WordDecoder:
         t_us = _held(at_high, self.clock.unwrap(payload[at_high]) << 12, len(words))
         t_us |= _held(at_low, payload[at_low], len(words))
         line = _held(at_line, payload[at_line] & 0x7FF, len(words))
-        # Every vector moves the base on by its width, until a word sets it again.
+        # Every vector advances the base by its width, until a word sets it again.
         n_bits = self._n_bits[code]
         moved = np.cumsum(n_bits) - n_bits
         base = _held(at_base, (payload[at_base] & 0x7FF) - moved[at_base], len(words)) + moved
@@ -150,7 +151,7 @@ def _held(at: NDArray[np.intp], values: NDArray[np.int64], n: int) -> NDArray[np
 def _expand(
     payload: NDArray[np.int64], is_single: NDArray[np.bool_], n_bits: NDArray[np.int64]
 ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """List the word and the bit of every event, in order: one of each single, the set bits of each vector."""
+    """List the word and the bit of every event in order: one per single event, the set bits per vector."""
     vectors = np.flatnonzero(n_bits)
     masks = (payload[vectors] & ((1 << n_bits[vectors]) - 1)).astype("<u2")
     # Only vectors are unpacked: 16 places per word are many if nearly all events are single.

@@ -23,7 +23,7 @@ from lce_rig.core.errors import SourceError, reading, reason_of
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MAX_LISTED = 40
-# Endings that a recorder adds: compressed files, and those of ROS 1 that it did not close.
+# Suffixes added by recorders: of compressed files, and of unclosed ROS 1 files.
 _COMPRESSED = (".zstd", ".zst")
 _ADDED = (*_COMPRESSED, ".active")
 _MAGIC = {".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0", ".mcap": b"\x89MCAP0\r\n"}
@@ -31,7 +31,7 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 class RawMessage(NamedTuple):
-    """A message as it lies in a bag, or as a topic brings it.
+    """An undecoded message from a bag or a live topic.
 
     Attributes:
         msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
@@ -109,12 +109,12 @@ class BagFile:
 
     @contextmanager
     def _readers(self) -> Iterator[list[Any]]:
-        """Open the bag's files; one that cannot be opened is noted in `damages`."""
+        """Open the bag's files; note those that cannot be opened in `damages`."""
         from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
 
         _bound_rosbags()
-        # A folder's metadata.yaml names its files; without it each file is opened for itself.
+        # A folder's metadata.yaml lists its files; without it each file is opened separately.
         is_described = self.path.is_dir() and (self.path / "metadata.yaml").is_file()
         self.damages.clear()
         with ExitStack() as stack:
@@ -146,7 +146,7 @@ def kind_of(path: Path) -> str:
 
 
 def _bag_files(folder: Path) -> list[Path]:
-    """List the files of a bag in a folder, without those that lie there decompressed, too."""
+    """List the files of a bag in a folder, without compressed duplicates."""
     files = sorted(file for file in folder.iterdir() if not file.is_dir() and kind_of(file) in SUFFIXES)
     return [file for file in files if file.with_suffix("") not in files]
 
@@ -181,7 +181,7 @@ def _plain(file: Path) -> Iterator[Path]:
 
 @cache
 def _bound_rosbags() -> None:
-    """Make rosbags unpack chunks, messages and files within the bounds of `core.bounds`.
+    """Make rosbags unpack chunks, messages and files within the limits of `core.bounds`.
 
     The tables of decompressors are replaced, as theirs unpack a chunk before its size is checked.
     """
@@ -212,7 +212,7 @@ def _open_unpacked(packed: Any, _mode: str) -> Unpacking:
 
 
 def _zstd() -> Any:
-    """Import the module of which rosbags requires the same."""
+    """Import a module of which rosbags requires the same version."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
@@ -232,7 +232,7 @@ def _type_of(connection: Any) -> str:
 
 
 def _repair(path: Path) -> str:
-    """Return the tool that restores the index of a bag whose recorder was killed."""
+    """Return the name of the tool that restores the index of a bag with a killed recorder."""
     commands = {".bag": f"rosbag reindex {path.name}", ".mcap": f"mcap recover {path.name}"}
     folder = (path if path.is_dir() else path.parent).resolve()
     command = commands.get(kind_of(path), f"ros2 bag reindex {folder.name}")

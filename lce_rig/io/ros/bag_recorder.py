@@ -33,7 +33,7 @@ _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def open_bag_writer(path: Path) -> Any:
-    """Begin a bag: ROS 1 if the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    """Open a bag for writing: ROS 1 for a path ending in .bag, else ROS 2's mcap; a context manager."""
     if path.suffix == ".bag":
         from rosbags.rosbag1 import Writer as Ros1Writer
 
@@ -49,7 +49,7 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
 
     Args:
         image: the image; one without a timestamp gets 0, which readers take for none.
-        frame_id: of the header.
+        frame_id: frame of the header.
         is_ros1: whether for ROS 1.
     """
     height_px, width_px = image.pixels.shape[:2]
@@ -74,7 +74,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryvie
         settings: the LiDAR's frame, and which firing its timestamps mark.
         is_ros1: whether for ROS 1.
     """
-    # The LiDAR's driver would have timestamped the first firing, or the last one.
+    # The LiDAR's driver would have timestamped the first or the last firing.
     stamp_ns = scan.stamp_ns or 0
     if scan.stamp_ns is not None and settings.timestamps.reference != "first_firing":
         if scan.offset_ns is not None and len(scan.offset_ns):
@@ -131,7 +131,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
     """
 
     def __init__(self, path: Path, rig: Rig) -> None:
-        """Begin an empty bag.
+        """Create an empty bag.
 
         Raises:
             SourceError: something is there already, or nothing can be written there.
@@ -147,7 +147,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
 
     @classmethod
     def in_folder(cls, folder: Path, rig: Rig, ros: int = 1) -> "BagRecorder":
-        """Begin recording.bag, or for ROS 2 recording/, in a new folder.
+        """Create recording.bag, or for ROS 2 recording/, in a new folder.
 
         Raises:
             SourceError: the folder is there already, or cannot be made.
@@ -193,7 +193,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             self._write(topic, CLOUD_TYPE, received_ns, cloud)
 
     def close(self) -> None:
-        """Write the index; does nothing the second time, or after a failure.
+        """Write the index; a second call, or one after a failure, has no effect.
 
         Raises:
             SourceError: the disk is full.

@@ -34,7 +34,7 @@ class EventPacket(NamedTuple):
     """One event_camera_msgs/EventPacket, undecoded.
 
     Attributes:
-        number: of the message, as the driver counted them.
+        number: sequence number of the message, as counted by the driver.
         time_base_ns: origin of the timestamps inside; 0 if they count from the sensor's start.
         encoding: one of `ENCODINGS`.
         words: (N,) uint16, the payload.
@@ -77,7 +77,7 @@ def read_event_head(message: RawMessage) -> EventHead:
 
 
 class PacketDecoder:
-    """Decodes the packets of one topic in turn; EVT3 continues from one to the next."""
+    """Decodes the packets of one topic in order; EVT3 continues from packet to packet."""
 
     def __init__(self) -> None:
         self._evt3 = WordDecoder(EVT3)
@@ -95,7 +95,7 @@ class PacketDecoder:
         elif packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
             events = self._compressed.decode(packet.words)
-            # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
+            # The driver's time base has its own nanoseconds; the codec drops them, and so does this reader.
             base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
         elif packet.encoding != "trigger":
             raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
@@ -137,7 +137,7 @@ class BagEvents(EventStream):
                 break
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
-        """Yield the events, a message at a time."""
+        """Yield the events, message by message."""
         decoder = PacketDecoder()
         last_number: int | None = None
         for index, message in self._messages(self._topic, losses):
@@ -163,7 +163,7 @@ class BagEvents(EventStream):
             raise ValueError(f"it is of {head.width_px}x{head.height_px} pixels")
 
     def _messages(self, topic: str, losses: Losses) -> Iterator[tuple[int, RawMessage]]:
-        """Yield the messages of a topic with their number; damage of the bag is counted and ends them."""
+        """Yield the numbered messages of a topic; damage of the bag is counted and ends the iteration."""
         try:
             yield from enumerate(self._bag.messages({topic}))
         except SourceError as error:

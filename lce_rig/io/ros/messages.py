@@ -1,4 +1,4 @@
-"""Messages of ROS 1 and ROS 2: their definitions, and images, point clouds and event arrays as NumPy arrays.
+"""ROS 1 and ROS 2 messages: definitions, and images, point clouds and event arrays as NumPy arrays.
 
 References:
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
@@ -44,7 +44,7 @@ _DEFINITIONS = {
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
     "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
     "event_camera_msgs/msg/EventPacket": _PACKET,
-    # The same by its earlier name.
+    # The same type under its former name.
     "event_array_msgs/msg/EventArray": _PACKET,
     "dvs_msgs/msg/Event": "uint16 x\nuint16 y\n{time} ts\nbool polarity\n",
     EVENT_ARRAY_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n",
@@ -65,7 +65,7 @@ def typestore(is_ros1: bool) -> Any:
 
 
 def deserialize(message: RawMessage) -> Any:
-    """Deserialise by ROS's own definitions; a bag's own may be missing, or unsupported by rosbags.
+    """Deserialise by ROS's standard definitions; a bag's may be missing, or unsupported by rosbags.
 
     Raises:
         ValueError: it is damaged.
@@ -75,7 +75,7 @@ def deserialize(message: RawMessage) -> Any:
     msgtype = message.msgtype.replace("/", "/msg/")
     try:
         return (store.deserialize_ros1 if is_ros1 else store.deserialize_cdr)(message.data, msgtype)
-    except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
+    except Exception as error:  # Damaged messages raise any of these: struct, assert, unicode, index.
         raise ValueError(f"a message is damaged: {reason_of(error)}") from None
 
 
@@ -180,7 +180,7 @@ _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 
 
 def decode_pointcloud2(message: Any) -> NDArray[Any]:
-    """View a message's points by their names, row by row.
+    """View a message's points by field name, row by row.
 
     Field offsets, gaps between fields, gaps after rows and byte order are taken from the message.
 
@@ -240,8 +240,8 @@ class EventHead(NamedTuple):
     """The first fields of both kinds of event message.
 
     Attributes:
-        stamp_ns: of the header.
-        frame_id: of the header.
+        stamp_ns: timestamp of the header.
+        frame_id: frame of the header.
         width_px, height_px: resolution of the sensor.
     """
 
@@ -269,7 +269,7 @@ _TIME_AT, _NAME_AT = 4, 12
 
 
 def decode_event_array(data: bytes, encoding: str) -> tuple[EventHead, EventColumns]:
-    """Decode one dvs_msgs/EventArray; rosbags would make an object per event.
+    """Decode one dvs_msgs/EventArray without rosbags, which would create an object per event.
 
     Its header's timestamp is device time, so that the host's is left open.
 
@@ -314,7 +314,7 @@ def encode_event_array(events: Events, frame_id: str, encoding: str) -> bytes:
 
     Args:
         events: at least one.
-        frame_id: of the header.
+        frame_id: frame of the header.
         encoding: "ros1" or "cdr".
     """
     raw = np.zeros(len(events), _ROS1_EVENT if encoding == "ros1" else _CDR_EVENT)

@@ -1,4 +1,4 @@
-"""Sensors of a bag whose timestamps are of another clock than the others', mapped by their times of receipt.
+"""Sensors of a bag with timestamps of another clock, mapped by their times of receipt.
 
 The recorder notes on one clock when it received each message. A message is received after its data: a scan
 after its last firing, an image after its exposure.
@@ -18,15 +18,15 @@ from lce_rig.io.ros.bag_file import BagFile
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import fit_clock
 
-# Larger differences of two sensors' delays, s, are of their clocks: messages wait less in any pipeline.
+# Difference of two sensors' delays above which their clocks differ, s: messages wait less in any pipeline.
 _MAX_DELAY_S = 2.0
-# Messages read to find the delays, in all and of each topic: raw images have megabytes.
+# Messages read to find the delays, in total and per topic: raw images have megabytes.
 _N_PROBED, _N_OF_TOPIC = 500, 5
 # Maximum drift of a quartz clock; a larger one comes from the scatter of a few receipts.
 _MAX_DRIFT = 200e-6
 # Standard deviation of the unknown part of a delay: transport, and processing by the driver.
 _DELAY_SIGMA_NS = 30_000_000.0
-# Receipts that scatter more about the line do not follow the timestamps.
+# Scatter about the line above which receipts do not follow the timestamps.
 _MAX_RMS_NS = 500_000_000.0
 # ROS 1 begins with the header's number, CDR with its encapsulation; both take 4 bytes.
 _TIME_AT = 4
@@ -35,14 +35,14 @@ Stamps = NDArray[np.int64]
 
 
 def find_foreign(bag: BagFile, topics: Collection[str], *, has_host: bool) -> list[str]:
-    """List the topics whose timestamps are of another clock than the rest of the bag.
+    """List the topics with timestamps of another clock than the rest of the bag.
 
     Timestamps that are all as far from their receipt are those of one clock, as in a bag that was replayed
     into another.
 
     Args:
         bag: whose messages all have headers.
-        topics: of images and scans.
+        topics: topics of images and scans.
         has_host: whether other streams of the rig are on the recorder's clock.
     """
     stamps, receipts = _read_times(bag, topics, _N_PROBED, _N_OF_TOPIC)
@@ -57,7 +57,7 @@ def fit_to_receipts(bag: BagFile, topic: str, *, is_sent_after: bool) -> ClockMo
 
     Args:
         bag: that holds it.
-        topic: of images or scans.
+        topic: topic of images or scans.
         is_sent_after: whether messages are sent a period after the moment that their timestamp marks: scans
             marked by their first firing.
 
@@ -97,7 +97,7 @@ def describe(subject: str, clock: ClockModel) -> Finding:
 def _read_times(
     bag: BagFile, topics: Collection[str], n_probed: int | None = None, n_of_topic: int | None = None
 ) -> tuple[Mapping[str, Stamps], Mapping[str, Stamps]]:
-    """Read timestamps of headers and receipts of messages by topic, as far as the bag can be read."""
+    """Read header timestamps and receipts by topic, up to the end of the readable part."""
     times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
     for message in islice(bag.messages(topics), n_probed):
         if len(message.data) >= _TIME_AT + 8:

@@ -1,4 +1,4 @@
-"""A bag as a stream of images, scans and events, by the timestamps in their headers."""
+"""A bag as a stream of images, scans and events, by header timestamps."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -33,12 +33,12 @@ from lce_rig.rig import CameraSettings, LidarSettings, Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.scan_pairing import rig_offset_ns
 
-# Scans come by this share of the period too early, at most.
+# Largest fraction of the period by which scans arrive early.
 _EARLY = 0.05
 
 
 class TopicDecoder:
-    """Makes the images or scans of one topic from its messages, of a bag or live.
+    """Converts the messages of one topic, from a bag or live, to images or scans.
 
     Args:
         target: the sensor of the topic.
@@ -89,7 +89,7 @@ class TopicDecoder:
         # Scans without rings are sparse: they are joined to scans of the profile's rate.
         ready: list[Image | Scan] = []
         for scan in samples:
-            assert isinstance(scan, Scan)  # as a LiDAR has no images
+            assert isinstance(scan, Scan)  # a LiDAR has no images
             first_ns = self._parts[0].stamp_ns if self._parts else None
             least_ns = (1 - _EARLY) * 1e9 / self._settings.rate_hz
             if first_ns is not None and (scan.stamp_ns or 0) - first_ns >= least_ns:
@@ -105,12 +105,12 @@ class TopicDecoder:
         return [] if last is None else self._in_order([last])
 
     def account(self) -> list[str]:
-        """List assumptions and losses, in words."""
+        """List assumptions and losses as text."""
         lines = sorted(self.notes) + worded(self.losses)
         return lines if self._packets is None else lines + worded(self._packets.losses)
 
     def _assemble(self, content: Any) -> list[Image | Scan]:
-        """Assemble the packets of a message; a scan ends at the rotor's cut, not with the message."""
+        """Assemble the packets of a message; scans end at the rotor's cut, not with messages."""
         assert isinstance(self._settings, LidarSettings)  # as packets have no camera
         if self._packets is None:
             self._packets = Vlp16Stream(self._target.sensor, self._settings)
@@ -184,7 +184,7 @@ class BagRecording:
         notes: the topics of each sensor, and after reading the losses.
         key: fingerprint of the bag.
         n_samples: number of messages with images and scans on these topics.
-        streams: of the sensors.
+        streams: streams of the sensors.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -251,7 +251,7 @@ class BagRecording:
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
 
     def _fit_clocks(self) -> dict[str, ClockModel]:
-        """Fit the clocks of sensors that are not the others', by topic; note each.
+        """Fit the clocks of sensors that differ from the others', by topic; add a note for each.
 
         The profile's `expected_offset_s` comes first, and packets bring their arrivals.
         """
@@ -263,7 +263,7 @@ class BagRecording:
         }
         has_host = len(topics) < len(self._targets) or bool(self._events)
         clocks: dict[str, ClockModel] = {}
-        # A bag that cannot be read to its end is read as far as it goes, and its damage reported, later.
+        # Read an incomplete bag as far as possible; its damage is reported later.
         with suppress(SourceError):
             for topic in find_foreign(self._bag, topics, has_host=has_host):
                 target = topics[topic]
@@ -276,7 +276,7 @@ class BagRecording:
         return clocks
 
     def _open_events(self) -> dict[Stream, EventRecording]:
-        """Take the topics of raw events out of the others and open them.
+        """Separate the topics of raw events and open them.
 
         Raises:
             SourceError: events of another resolution; or no events, and no images either.

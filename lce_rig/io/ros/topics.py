@@ -30,11 +30,11 @@ CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES
 PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 _INFO = "sensor_msgs/CameraInfo"
-# Images that image_proc computes from image_raw: as a second camera they would count twice.
+# Images computed by image_proc from image_raw: as a second camera they would count twice.
 _COMPUTED = frozenset({"image_mono", "image_color", "image_rect", "image_rect_color"})
-# Messages of video, as theora_image_transport/Packet and foxglove_msgs/CompressedVideo.
+# Video message types, such as theora_image_transport/Packet and foxglove_msgs/CompressedVideo.
 _VIDEO = re.compile(r"image_transport\w*/|CompressedVideo$")
-# Drivers start within this many messages of each other.
+# Number of messages within which drivers start.
 _N_PROBED = 5000
 Topics: TypeAlias = Mapping[str, tuple[str, int]]
 """(Message type, number of messages) by topic."""
@@ -72,7 +72,7 @@ class Target:
 def choose_topics(
     path: Path, topics: Topics, rig: Rig, options: SourceOptions, notes: list[str]
 ) -> dict[str, Target]:
-    """Match topics and sensors: as asked, else as the profile says, else the only topic of the right type.
+    """Match topics with sensors: as requested, else by the profile, else the only topic of the right type.
 
     Args:
         path: the bag, for messages.
@@ -100,7 +100,7 @@ def choose_topics(
     for target, profile_topic in targets.items():
         candidates = [asked[target]] if target in asked else [profile_topic] if profile_topic else []
         if target not in asked and profile_topic and target.channel is not None:
-            candidates.append(f"{profile_topic}/compressed")  # a recorder may have kept that one only
+            candidates.append(f"{profile_topic}/compressed")  # a recorder may have kept only this one
         topic = next((topic for topic in candidates if topic in topics), None)
         if topic is None:
             if target in asked and not options.is_part:
@@ -148,7 +148,7 @@ def choose_topics(
 
 
 def _list_targets(rig: Rig, options: SourceOptions) -> tuple[dict[Target, str | None], dict[Target, str]]:
-    """List the rig's sensors with the profile's topic of each, and the topics that were asked for.
+    """List the rig's sensors with their topics from the profile, and the requested topics.
 
     Raises:
         SourceError: a topic was asked for a sensor that the rig does not have.
@@ -182,7 +182,7 @@ class SensorTopic:
         frame: frame_id of the first message's header, or "".
         size_px: (width, height) of images and event arrays; None if not stated.
         n_rings: number of rings of a scan; None for points without a ring.
-        intrinsics: of its images, from its camera_info topic; None if missing or unusable.
+        intrinsics: intrinsics of its images, from its camera_info topic; None if missing or unusable.
         note: the reason why the intrinsics are unusable, or the changes made to fit them to the images.
         cloud: the first point cloud of a topic of scans; None for packets.
     """
@@ -200,12 +200,12 @@ class SensorTopic:
 
     @property
     def namespace(self) -> str:
-        """The topic without its last part, and without that of a transport such as compressed."""
+        """The topic's namespace: without its last part and any image transport suffix."""
         return _namespace(self.image_topic)
 
     @property
     def image_topic(self) -> str:
-        """The topic without the part of a transport, such as compressed."""
+        """The topic without an image transport suffix such as /compressed."""
         return self.topic.removesuffix("/compressed").removesuffix("/theora")
 
 
@@ -301,7 +301,7 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
 
 
 def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[SensorTopic]:
-    """Leave out images that are computed from raw ones beside them; `skipped` receives them."""
+    """Drop images computed from raw ones in the same bag; they are added to `skipped`."""
     raw = {sensor.namespace: sensor.topic for sensor in sensors if sensor.image_topic.endswith("/image_raw")}
     kept = []
     for sensor in sensors:

@@ -22,7 +22,7 @@ class Thumbnail(NamedTuple):
 
     Attributes:
         pixels: (h, w) grey or (h, w, 3) BGR.
-        width_px: of the image.
+        width_px: width of the image.
     """
 
     pixels: Picture
@@ -46,8 +46,8 @@ RED: Colour = (40, 40, 200)
 # cv2's font of scale 1, px.
 _LINE, _LETTER, _FONT_PX = 0.022, 0.0085, 40.0
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
-# Pictures have large even areas and thin marks: run lengths compress them as well as a search, in half the
-# time.
+# Images have large uniform areas and thin marks: run-length encoding compresses them as well as a search, in
+# half the time.
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
 
@@ -74,7 +74,7 @@ def reduced(pixels: Picture) -> Thumbnail:
 
 
 def show_image(axes: Any, pixels: Picture) -> None:
-    """Show an image, grey or BGR, in axes of Matplotlib, whose limits stay."""
+    """Show an image, grey or BGR, in Matplotlib axes, without changing their limits."""
     rgb = pixels[..., ::-1] if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     axes.imshow(rgb, interpolation="antialiased")
     axes.autoscale(False)
@@ -135,7 +135,7 @@ def draw_diamonds(
 def draw_line(
     picture: Picture, pixels: Array, colour: Colour, width_px: int = 2, casing: Colour | None = BLACK
 ) -> None:
-    """Draw a polyline through (N, 2) px, interrupted at NaN pixels, cased to be visible anywhere."""
+    """Draw a polyline through (N, 2) px, interrupted at NaN pixels, with a casing for contrast."""
     ends = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
     for part in np.split(pixels, ends):
         part = part[np.isfinite(part).all(axis=1)]
@@ -148,7 +148,7 @@ def draw_line(
 
 
 def with_note(picture: Picture, text: str, colour: Colour) -> Picture:
-    """Add text in white on a band of a colour under an image."""
+    """Add white text on a coloured band below an image."""
     line_px = _LINE * picture.shape[1]
     lines = textwrap.wrap(text, round(1 / _LETTER))
     band = np.empty((round((len(lines) + 0.5) * line_px), *picture.shape[1:]), dtype=np.uint8)

@@ -97,7 +97,7 @@ def draw_debug(
 def _draw_camera(
     axes: Any, image: Image, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics
 ) -> None:
-    """Draw the board that was detected, or the corners in a refused image, of the pattern or a part of it."""
+    """Draw the detected board, or the corners in a refused image, of the pattern or a part of it."""
     show_image(axes, image.pixels)
     if isinstance(result, ImageBoard):
         axes.plot(*outline_px(result.T_cam_board, board, intrinsics).T, color="white")

@@ -35,7 +35,7 @@ _WIDTH_IN = 16
 _TITLE_IN, _WIDE, _MANY = 0.3, 2.0, 600  # Height of a title; ratio of a wide image; edges drawn small.
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
-# Scans that choose the range scale of a session's images.
+# Number of scans that determine the range scale of a session's images.
 _SCANS_OF_SCALE = 8
 _GROUND = (38, 34, 32)
 _WINDOW = Intrinsics(640.0, 640.0, 639.5, 359.5, 1280, 720)
@@ -101,9 +101,9 @@ def draw_edges(
     """Draw a scan's edges into the image under several extrinsics, side by side; wide images are stacked.
 
     Args:
-        image: of the capture.
-        edges: of its scan.
-        intrinsics: of the camera.
+        image: image of the capture.
+        edges: edges of its scan.
+        intrinsics: intrinsics of the camera.
         poses: T_cam_lidar (4, 4) by name.
         title: one line.
 
@@ -148,7 +148,7 @@ def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
 def draw_image_board(
     picture: Picture, factor: int, image_board: BoardPose, board: Board, intrinsics: Intrinsics
 ) -> None:
-    """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
+    """Draw the board's outline at T_cam_board, with lens distortion, and the measured corners."""
     outline = outline_px(image_board.T_cam_board, board, intrinsics)
     width_px = max(1, round(2e-3 * picture.shape[1]))
     canvas.draw_line(picture, (outline + 0.5) * factor - 0.5, WHITE, width_px)
@@ -193,7 +193,7 @@ def _draw_scan(
 
 
 def is_overlay(path: Path) -> bool:
-    """Return whether a file or folder has a name or a page that `draw_check` gives it."""
+    """Check whether a file or folder has a name or a page from `draw_check`."""
     names_file = re.fullmatch(r"[0-9]{6,}\.png", path.name) is not None or path.name == PAGE
     return names_file or (path / PAGE).is_file()
 
@@ -212,8 +212,8 @@ def draw_check(
 
     Args:
         session: the source of the captures.
-        detections: of the session.
-        check: of one channel on these captures.
+        detections: detections of the session.
+        check: result for one channel on these captures.
         folder: receives `<capture>.png` and the page.
         image_of: returns the channel's image in a capture; None if it cannot be read.
         scan_of: returns the cloud to draw in a capture.
@@ -283,7 +283,7 @@ def _failure(check: SessionCheck) -> str:
 
 
 def _cause(name: str, c: Calibration) -> str:
-    """State why a capture was not used; "" if it was, or if the extrinsics are of another session."""
+    """State why a capture was not used; "" if it was used, or belongs to another session."""
     refusal = c.captures_refused.get(name)
     if not c.captures_used or name in c.captures_used:
         return ""
@@ -322,10 +322,10 @@ def _draw(
 
 
 def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
-    """Return a check as a camera at the first LiDAR, which looks at the boards, would see it.
+    """Convert a check to the view of a virtual camera at the first LiDAR, facing the boards.
 
     Args:
-        check: of two LiDARs.
+        check: result for two LiDARs.
 
     Returns:
         The same as of that camera, and T_camera_first (4, 4).
@@ -343,10 +343,10 @@ def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
 
 
 def draw_cloud(scan: Scan, T_view: Array) -> Image:
-    """Draw the first LiDAR's cloud in grey, as the camera in its place would see it.
+    """Draw the first LiDAR's point cloud in grey, seen by a virtual camera in its place.
 
     Args:
-        scan: of the first LiDAR.
+        scan: scan of the first LiDAR.
         T_view: (4, 4) from its frame to the camera's.
     """
     points = transform(T_view, scan.points[np.isfinite(scan.points).all(axis=1)])

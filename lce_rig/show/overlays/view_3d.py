@@ -1,4 +1,4 @@
-"""The coloured cloud and the cameras of a capture in 3D, in a window or as a picture, by Open3D."""
+"""The coloured point cloud and the cameras of a capture in 3D, in a window or as an image, by Open3D."""
 
 import os
 import sys
@@ -31,7 +31,7 @@ class CaptureIn3D:
     """The points of one capture, frame lidar.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         points: (N, 3) m.
         colours: (N, 3) RGB.
         is_seen: (N,) whether a camera gave the colour.
@@ -115,14 +115,14 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
 
 
 def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]) -> None:
-    """Write the window's first view as PNG or JPEG, by the name of the file.
+    """Render the capture in 3D to a PNG or JPEG file; the suffix selects the format.
 
     Raises:
-        SourceError: nothing can be rendered here, or the name does not end in a known suffix.
+        SourceError: rendering is not possible on this computer, or the suffix is not supported.
         SessionError: the file cannot be written.
     """
     if path.suffix.lower() not in _PICTURES:
-        raise SourceError(f"{path} is no name of a picture", "Name a PNG or JPEG file.")
+        raise SourceError(f"{path} is not an image file name", "Name a PNG or JPEG file.")
     o3d = _open3d()
     window = _opened(o3d.visualization.Visualizer(), is_visible=False)
     _fill(o3d, window, _cloud(o3d, capture), cameras)
@@ -133,7 +133,7 @@ def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]
         window.capture_screen_image(str(drawn), do_render=True)
         window.destroy_window()
         if not drawn.exists():
-            raise SourceError("Open3D has drawn no picture", _HINT)
+            raise SourceError("Open3D did not write an image", _HINT)
         write_atomically(path, drawn.read_bytes())
 
 
@@ -162,7 +162,7 @@ def _cloud(o3d: Any, capture: CaptureIn3D) -> Any:
 
 
 def _fill(o3d: Any, window: Any, cloud: Any, cameras: Sequence[CameraIn3D]) -> None:
-    """Add cloud, axes of the LiDAR and frusta, and look from behind the first camera."""
+    """Add point cloud, axes of the LiDAR and frusta, and look from behind the first camera."""
     window.add_geometry(cloud)
     window.add_geometry(o3d.geometry.TriangleMesh.create_coordinate_frame(0.2))
     for camera in cameras:
@@ -176,7 +176,7 @@ def _fill(o3d: Any, window: Any, cloud: Any, cameras: Sequence[CameraIn3D]) -> N
 
 
 def _look_from_behind(o3d: Any, window: Any, T_lidar_cam: Array) -> None:
-    """Place the eye behind and above a camera; a distance in metres, as the cloud may reach far."""
+    """Place the viewpoint behind and above a camera, at a fixed distance, m: point clouds may reach far."""
     forward, up = T_lidar_cam[:3, 2], np.array([0.0, 0.0, 1.0])
     eye = T_lidar_cam[:3, 3] - 1.6 * forward + 0.8 * up
     z = T_lidar_cam[:3, 3] + 2.0 * forward - eye
@@ -184,7 +184,7 @@ def _look_from_behind(o3d: Any, window: Any, T_lidar_cam: Array) -> None:
     x = np.cross(z, up) if abs(z @ up) < 0.99 else T_lidar_cam[:3, 0]
     x /= np.linalg.norm(x)
     view = window.get_view_control()
-    # By default the view is clipped to the cloud's own size.
+    # By default the view is clipped to the point cloud's size.
     view.set_constant_z_near(0.05)
     view.set_constant_z_far(300.0)
     parameters = view.convert_to_pinhole_camera_parameters()

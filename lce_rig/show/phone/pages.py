@@ -90,7 +90,7 @@ def encode_picture(pixels: Pixels) -> bytes:
 
 
 class Encoder:
-    """Compresses each image once, however many watch, in a thread of its own.
+    """Compresses each image once for all viewers, in a separate thread.
 
     Attributes:
         n_encoded: images compressed.
@@ -103,12 +103,12 @@ class Encoder:
         self._thread = ThreadPoolExecutor(1, "preview-pictures")
 
     async def encode(self, pixels: Pixels) -> bytes:
-        """Compress an image, or give what it was compressed to before."""
+        """Return the image as JPEG; each image is encoded once."""
         if self._jpeg is None or self._pixels is not pixels:
             loop = asyncio.get_running_loop()
             self._pixels, self._jpeg = pixels, loop.run_in_executor(self._thread, encode_picture, pixels)
             self.n_encoded += 1
-        # One viewer that leaves must not take the image from the others.
+        # A viewer that leaves must not affect the others.
         return await asyncio.shield(self._jpeg)
 
     def close(self) -> None:
@@ -151,7 +151,7 @@ _HEADERS = {
 
 
 class Feed:
-    """Hold one state, the newest; a slow reader misses those between. Requests go the other way."""
+    """Holds only the newest state; a slow reader misses those in between. Requests go the other way."""
 
     def __init__(self) -> None:
         self._newest: tuple[int, float, LiveState] | None = None
@@ -171,17 +171,17 @@ class Feed:
         return self._asked.popleft() if self._asked else None
 
     def newest(self) -> tuple[int, LiveState] | None:
-        """Return the newest state and its running number, from 1; None before the first."""
+        """Return the newest state and its sequence number, from 1; None before the first."""
         newest = self._newest
         return None if newest is None else (newest[0], newest[2])
 
     def age_s(self) -> float | None:
-        """Compute how long ago the newest state came."""
+        """Return the age of the newest state."""
         newest = self._newest
         return None if newest is None else time.monotonic() - newest[1]
 
     async def wait_beyond(self, number: int, timeout_s: float) -> bool:
-        """Wait for a state newer than `number`; False where none came in time."""
+        """Wait for a state newer than `number`; False on timeout."""
         end_s = time.monotonic() + timeout_s
         while self._newest is None or self._newest[0] <= number:
             if time.monotonic() > end_s:
@@ -191,7 +191,7 @@ class Feed:
 
 
 class Viewer:
-    """Feeds one open page with the newest state as fast as it can follow, and no faster.
+    """Sends the newest state to one open page as fast as the page can follow.
 
     The page answers each message once it is on the screen, and reports whether it is visible; only then are
     images sent. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
@@ -208,7 +208,7 @@ class Viewer:
         self._pixels: Pixels | None = None
 
     async def serve(self) -> None:
-        """Feed the page until it goes away, sleeps or sends what no page sends."""
+        """Feed the page until it closes, sleeps or sends an invalid message."""
         is_answered = True
         with suppress(ConnectionError, asyncio.TimeoutError):
             while is_answered:
@@ -266,7 +266,7 @@ class Viewer:
 
 
 class Pages:
-    """Answers requests that bring the token, in the link or in the cookie that the link leaves.
+    """Answers requests with the token, in the link or in the cookie set by the link.
 
     The cookie is sent by pages of this site only (SameSite), so that no other site shows or watches the page.
 

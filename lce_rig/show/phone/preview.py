@@ -1,4 +1,4 @@
-"""The page as the collection sees it: addresses as people write them, started, updated, closed."""
+"""The collection's interface to the page: parse addresses, start, update, close."""
 
 import asyncio
 import fcntl
@@ -23,7 +23,7 @@ _HINT = (
     "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080: an address of this computer "
     "(`hostname -I` lists them, 0.0.0.0 stands for all), a free port above 1023 (`ss -ltn` lists used ones)."
 )
-# linux/sockios.h; Python names neither.
+# ioctl number of linux/sockios.h that Python does not define.
 _SIOCGIFADDR = 0x8915
 _INTERFACE = struct.Struct("16s20s")
 
@@ -126,7 +126,7 @@ class Preview:
         self._stop: asyncio.Event | None = None
 
     def start(self) -> str:
-        """Begin to serve, in a thread of its own, and give the link.
+        """Start serving in a separate thread, and return the link.
 
         Raises:
             UsageError: the port is in use or not permitted, or the address is not this computer's.
@@ -139,7 +139,7 @@ class Preview:
         return self.urls[0]
 
     def publish(self, state: LiveState) -> None:
-        """Show a state; never blocks, and the newest wins. Call it from one thread."""
+        """Show a state; never blocks, and the newest replaces others. Call it from one thread."""
         self._feed.publish(state)
 
     def asked(self) -> TakeBack | None:
@@ -148,7 +148,7 @@ class Preview:
 
     @property
     def n_pictures(self) -> int:
-        """Images that were compressed, 0 while the page is not open."""
+        """Number of compressed images, 0 while the page is not open."""
         return 0 if self._pages is None else self._pages.encoder.n_encoded
 
     def close(self) -> None:
@@ -156,7 +156,7 @@ class Preview:
         if self._thread is None or self._loop is None or self._stop is None:
             return
         if self._thread.is_alive():
-            with suppress(RuntimeError):  # its loop has just ended by itself
+            with suppress(RuntimeError):  # the loop has just ended on its own
                 self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(_STOP_S)
         self._thread = None

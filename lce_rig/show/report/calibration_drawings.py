@@ -28,7 +28,7 @@ class Evidence:
     """The LiDAR's points on all boards, and the corners in all images.
 
     Attributes:
-        observations: of the C captures used, by name.
+        observations: observations of the C captures used, by name.
         capture: (N,) index of each point's capture.
         plane_m: (N,) signed distance from the camera's board plane, positive behind it.
         ring: (N,) of each point.
@@ -104,7 +104,7 @@ def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Map
 def draw_from_above(
     calibration: Calibration, evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]
 ) -> Axes:
-    """Draw the plates about the LiDAR as seen from above, with the camera's field of view."""
+    """Draw the plates around the LiDAR from above, with the camera's field of view."""
     # Left is +y of the LiDAR, up is +x.
     plates = [transform(o.lidar.T_lidar_board, board.outline())[:, 1::-1] for o in evidence.observations]
     shown = np.concatenate([*plates, np.zeros((1, 2))])

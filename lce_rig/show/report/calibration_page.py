@@ -52,7 +52,7 @@ def report_page(
         session: whose result it is.
         file: the result.
         overlays: the folder of overlays beside the report, which shows them once they are drawn.
-        thumbnails: of the session, if some are known; the page is the same without.
+        thumbnails: thumbnails of the session, if some are known; the page is the same without.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
     origin, folder = file.provenance, session.path.resolve().name
@@ -72,7 +72,7 @@ def report_page(
         pair = _pair(session.rig, c, f"pair-{k}")
         for capture in pair["captures"]:
             capture["overlays"] = _overlays(session.capture(capture["name"]), c, overlays, has_folders)
-        # As many of each camera, so that the whole page stays small.
+        # Equal numbers for each camera, so that the page stays small.
         n_most = _MOST_PICTURES // len(file.pairs)
         pair["gallery"] = _gallery(session, c, pair["captures"], n_most, thumbnails or {})
         pair["steps"] = _next_steps(c, folder, has_previous)
@@ -131,7 +131,7 @@ def _gallery(
     n_most: int,
     thumbnails: Thumbnails,
 ) -> list[dict[str, Any]]:
-    """List captures with their pictures, those with the largest residuals first."""
+    """List captures with their images, those with the largest residuals first."""
     board, lens = session.rig.board.to_board(), None
     if not c.is_of_lidars:
         lens = session.rig.cameras[c.camera].to_intrinsics()
@@ -158,7 +158,7 @@ def _gallery(
 def _drawings(
     c: Calibration, board: Board, lens: Intrinsics | None, evidence: Evidence | None, anchor: str
 ) -> dict[str, Markup]:
-    """Draw a result; nothing without its boards."""
+    """Draw a result's figures by name; none without its boards or intrinsics."""
     if evidence is None or lens is None:
         return {}
     links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
@@ -179,7 +179,7 @@ def _drawings(
 
 
 def _statement(c: Calibration) -> str:
-    """Sum a result up in one paragraph that anyone can sign, with its figures."""
+    """Summarise a result in one paragraph, with its figures."""
     sensor = c.camera if c.is_of_peers else f"camera {c.camera}"
     known = (
         f"The pose of {sensor} relative to {c.lidar} has a standard deviation of "
@@ -239,7 +239,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
 
 
 _QUALITY, _OUTLINE_BGR = 60, (0, 140, 255)
-# Length of the events in a picture, ns: enough to show the board's edges.
+# Length of the events shown in an image, ns: enough to show the board's edges.
 _EVENTS_NS = 20_000_000
 
 
@@ -251,8 +251,8 @@ def picture_of(
     Args:
         capture: with the data.
         c: the result; its channels are tried in their order.
-        board: of the outline.
-        lens: of the camera.
+        board: board of the outline.
+        lens: intrinsics of the camera.
         thumbnails: images that need no decoding.
 
     Returns:
@@ -281,7 +281,7 @@ def data_uri(thumbnail: Thumbnail, outline: Array) -> str:
     """Draw an outline into a reduced image.
 
     Args:
-        thumbnail: of the image; it stays as it is.
+        thumbnail: thumbnail of the image, shown unchanged.
         outline: (N, 2) px of the image; points that are not finite are left out.
 
     Returns:

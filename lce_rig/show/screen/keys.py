@@ -1,4 +1,4 @@
-"""Keys and signals of a live collection: none has to be pressed."""
+"""Keys and signals of a live collection; all are optional."""
 
 import select
 import signal
@@ -68,7 +68,7 @@ def controls() -> Iterator[Controls]:
     try:
         if is_interactive:
             tty.setcbreak(sys.stdin)
-        # The first request ends it; captures that were decided on are written first.
+        # The first request ends the collection; accepted captures are written first.
         with patience(grace_s=10.0):
             yield asked
     finally:

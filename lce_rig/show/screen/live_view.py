@@ -78,7 +78,7 @@ _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, 
 _HEIGHT, _WIDTH = 24, 80
 # Width of bars and figures, characters; the drawing is beside them.
 _SIDE_WIDTH = 40
-# Written small in the headline, too: 8 M would be something else.
+# Units stay lower case in the headline, too: 8 M would mean something else.
 _UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
 _PLAIN_EVERY_S = 3.0
 _BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
@@ -105,7 +105,7 @@ def open_view(
     Args:
         is_plain: print plain lines in any case.
         has_keys: whether keys can be pressed.
-        links: of the page, the likeliest first; a screen covers the links printed earlier.
+        links: links of the page, the likeliest first; a screen covers the links printed earlier.
         wants_code: asked whether to show the page's QR code in place of the guidance.
     """
     bell = Bell(is_silent=not sys.stderr.isatty())
@@ -153,7 +153,7 @@ class Bell:
 
 
 class PlainView:
-    """A line on stderr whenever something changes; instructions, which change all the time, now and then."""
+    """Prints a line on stderr for each change; instructions, which change constantly, only now and then."""
 
     def __init__(self, bell: Bell) -> None:
         self._bell = bell
@@ -235,7 +235,7 @@ def render_code(link: str, state: LiveState, *, height: int = _HEIGHT, width: in
 
 
 def qr_lines(link: str) -> list[str]:
-    """Draw a QR code of a link with two modules a character; none of a link that no phone can open.
+    """Draw a QR code of a link with two modules per character; None for a link that phones cannot open.
 
     Light modules are drawn, dark ones are the background: the colours must be set, see `CODE_STYLE`.
     """
@@ -329,7 +329,7 @@ def render(
 
 
 def _stream_table(streams: tuple[StreamState, ...]) -> Any:
-    """Lay the streams out: name, rate, losses, and figures of the board or the fault."""
+    """Format the streams: name, rate, losses, and figures of the board or the fault."""
     from rich.table import Table
     from rich.text import Text
 
@@ -367,7 +367,7 @@ def _progress(state: LiveState) -> list[Any]:
     ):
         is_known = np.isfinite(sigma)
         shown = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
-        # Cautious with few captures: a result states less.
+        # Conservative with few captures: a result reports less.
         figure = f"below {shown} {unit}" if is_known else "-"
         style = "green" if is_known and sigma <= target else "yellow"
         lines.append(Text.assemble(f"{name:<11}", (figure, style), f" (target {target:g})"))
@@ -375,7 +375,7 @@ def _progress(state: LiveState) -> list[Any]:
 
 
 def _drawing(state: LiveState, most: tuple[int, int]) -> Any:
-    """Draw the board's present outline (dotted) and its wanted one; `most` is (columns, lines) at most."""
+    """Draw the board's present outline (dotted) and its target; `most` is (columns, lines) at most."""
     from rich.text import Text
 
     drawing = state.drawing

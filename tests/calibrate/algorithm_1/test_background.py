@@ -71,7 +71,7 @@ def test_background_wall_is_compensated():
     assert error_m(captures) < 0.6 * error_m([unaware(c) for c in captures])
 
 
-def test_the_echo_of_a_person_counts_by_itself():
+def test_background_person_echo_is_estimated_separately():
     rng = np.random.default_rng(1)
     captures = [held(c, c.lidar.edge_side > 0, rng.uniform()) for c in simulate(20, 7)]
     found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
@@ -91,11 +91,11 @@ def test_background_without_effect_is_unused():
             captures.append(sooner(capture, np.zeros(n), rng.uniform(0, 0.6, n), rng.uniform(0.1, 3.0, n)))
         found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
         n_moved += any(getattr(found, name) for name in NAMES)
-    # Ends that err like this, with returns lost, are moved in one session of a hundred.
+    # With such errors and lost returns, ring ends are shifted in about 1 % of sessions.
     assert n_moved <= 1
 
 
-def test_residuals_are_those_of_moved_ring_ends():
+def test_residuals_use_shifted_ring_ends():
     plain = simulate(20, 3)
     captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     moved, clean = (fit_extrinsic(c, BOARD, OPTIONS).diagnostics for c in (captures, plain))
@@ -103,7 +103,7 @@ def test_residuals_are_those_of_moved_ring_ends():
         assert getattr(moved, residual) == pytest.approx(getattr(clean, residual), rel=0.3)
 
 
-def test_a_person_behind_few_boards_is_too_little_to_tell():
+def test_background_person_behind_few_boards_is_ignored():
     # One capture says nothing of how captures scatter, and two hardly tell two effects from chance.
     rng = np.random.default_rng(2)
     for n_held in (1, 2, 3):

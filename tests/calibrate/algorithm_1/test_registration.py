@@ -36,7 +36,7 @@ def moments_of(normals, anchors, points):
     return rows.T @ rows / len(rows)
 
 
-def test_a_direction_that_no_plane_sees_is_left_at_zero():
+def test_unobserved_direction_stays_zero():
     normals = np.tile([0.0, 0.0, 1.0], (20, 1))
     points = np.random.default_rng(0).normal(size=(20, 3))
     Q, L = eliminate_linear(moments_of(normals, np.zeros((20, 3)), points))
@@ -55,7 +55,7 @@ def test_register_any_start_finds_the_pose(seed):
     np.testing.assert_allclose(linear_unknowns(L, R[0]), t_true, atol=1e-5)
 
 
-def test_every_minimum_found_is_a_minimum():
+def test_found_minima_are_stationary():
     Q = np.stack([eliminate_linear(moments_of(*make_planes(k, 0.05, 4)[:3]))[0] for k in range(10)])
     starts = cube_rotations()
     R, cost = minimise_on_so3(np.repeat(Q, 24, axis=0), np.tile(starts, (10, 1, 1)))

@@ -17,7 +17,7 @@ def at(blur, lost_share, reach=400.0):
 
 
 @pytest.mark.parametrize(("blur", "lost"), CASES)
-def test_it_is_a_density_and_its_slope_is_its_derivative(blur, lost):
+def test_end_density_integrates_to_one_and_slope_matches(blur, lost):
     x, p, _ = at(blur, lost)
     assert np.all(p > 0)
     # What is missing is the tail of Cauchy's distribution beyond the grid, a share of 0.01.

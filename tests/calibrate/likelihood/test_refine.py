@@ -42,7 +42,7 @@ def test_refine_laser_errors_fit_covariance(sessions):
     assert 1.3 < np.mean(nees) < 10.7
 
 
-def test_noise_and_constant_errors_come_out_as_simulated(sessions):
+def test_refine_recovers_simulated_noise_and_errors(sessions):
     for estimate in sessions:
         figures = estimate.diagnostics
         assert abs(figures.edge_shift_m - 0.008) < 4 * figures.edge_shift_sigma_m + 3e-4
@@ -126,7 +126,7 @@ def bent(item, height_m):
     return replace(item, surface=moved)
 
 
-def test_a_bent_plate_is_found_by_its_bow():
+def test_refine_bent_plate_bow_is_estimated():
     """Returns and ring ends of a plate whose middle lies 1 mm over its left and right edges."""
     flat = observations(20, 0, REAL)
     curved = [bent(each, 0.001) for each in flat]
@@ -139,7 +139,7 @@ def test_a_bent_plate_is_found_by_its_bow():
     assert np.linalg.norm(moved[:3]) < 1e-3
 
 
-def test_refine_differing_edge_shift_is_seen():
+def test_refine_differing_edge_shift_is_detected():
     """The beam reaches 6 mm over the edges of every second capture, 10 mm over those of the others."""
     near, far = (observations(20, 0, replace(REAL, footprint_m=reach_m)) for reach_m in (0.006, 0.010))
     mixed = [*near[::2], *far[1::2]]
@@ -183,7 +183,7 @@ def test_refine_second_camera_gains_accuracy():
     ],
     ids=["grazing", "few rings", "ring ends lost"],
 )
-def test_hard_captures_are_no_worse_than_claimed(scenario):
+def test_hard_captures_errors_fit_covariance(scenario):
     estimate = fit_extrinsic(simulate(20, 4, scenario), BOARD, ML)
     error = difference(estimate.T_cam_lidar, T_FORWARD)
     assert error @ np.linalg.solve(estimate.cov, error) < 30

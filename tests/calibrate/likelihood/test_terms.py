@@ -145,7 +145,7 @@ def test_terms_shift_matches_displaced_ends(scans, T_lidar_board, shift, axis):
     assert np.ptp(expected - plain.rows[:, -1]) > 5e-4
 
 
-def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board):
+def test_image_derivatives_match_differences(images, T_lidar_board):
     rows = image_rows(images, T_FORWARD, T_lidar_board, np.zeros(3))
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]

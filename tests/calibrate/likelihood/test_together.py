@@ -77,7 +77,7 @@ def test_join_camera_pair_beats_lidar_pairs(runs):
         assert np.trace(cov[3:, 3:]) < np.trace(alone[3:, 3:])
 
 
-def test_pairs_of_the_rig_are_those_of_the_estimates(runs):
+def test_rig_pairs_match_estimates(runs):
     for _, together in runs:
         for name in (LEFT, RIGHT):
             T, cov = together.between(name, "lidar")
@@ -88,7 +88,7 @@ def test_pairs_of_the_rig_are_those_of_the_estimates(runs):
             assert np.allclose(cov - of_profile, estimate.cov / inflation, rtol=1e-5, atol=1e-12)
 
 
-def test_the_order_of_cameras_does_not_matter(runs):
+def test_rig_estimate_ignores_camera_order(runs):
     own, together = runs[0]
     turned = join(dict(reversed(own.items())))
     assert turned.cameras == together.cameras
@@ -113,7 +113,7 @@ def test_join_differing_scan_is_refused(runs):
 
 
 @pytest.mark.slow
-def test_errors_and_claims_of_dozens_of_sessions_are_true():
+def test_rig_covariances_fit_errors_of_many_sessions():
     """40 sessions of 20 captures: the right camera in all of them, or in 6."""
     for few, sessions in (
         (20, [simulate_two(20, seed) for seed in range(20)]),
@@ -131,7 +131,7 @@ def test_errors_and_claims_of_dozens_of_sessions_are_true():
                 rows.append((*sizes(errors), claimed, nees(errors, covs)))
                 figures = "rms {:.4f} deg, {:.2f} mm; claimed {:.4f} deg; NEES {:.2f}".format(*rows[-1])
                 print(f"{name} of 20 and {few} captures: {figures}")
-            # No worse than alone, but for chance; for the camera in few captures much better.
+            # Apart from chance, no worse than separate estimates; much better for the camera in few captures.
             assert all(joint < 1.1 * own for own, joint in zip(rows[0][:2], rows[1][:2], strict=True))
             # 6 expected; 20 samples average within 3 standard errors of 0.77. Noise levels of few captures
             # are rather believed to be the usual ones, which are larger than the simulator's.

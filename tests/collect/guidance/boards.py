@@ -11,7 +11,7 @@ from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_po
 
 
 def model(priors=None, levels=None):
-    """Describe a VLP-16 and a camera before the board of the calibration's tests."""
+    """Build the model of a VLP-16 and a camera that face the board of the calibration's tests."""
     return SensorModel(
         board=BOARD,
         lens=CAMERA,

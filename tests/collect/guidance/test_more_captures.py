@@ -49,7 +49,7 @@ def test_plan_without_nominal_needs_beams(placements):
 @pytest.mark.parametrize(
     ("shares", "word"), [((0.02, 0.6), ""), ((0.02, 0.3), "on your right"), ((0.7, 0.98), "on your left")]
 )
-def test_an_outer_third_is_named_only_where_all_boards_are(shares, word):
+def test_outer_third_is_named_only_if_all_boards_are_in_it(shares, word):
     lens = Intrinsics(900, 900, 499.5, 299.5, 1000, 600, "radtan", (0.0,) * 4)
     centres = 2.0 * lens.unproject(np.array([[1000 * share, 300] for share in shares]))
     assert common_third(lens, centres) == word

@@ -26,7 +26,7 @@ def planner():
 
 
 @pytest.mark.parametrize(("profile", "camera"), [("rlfs", "cam"), ("rles", "davis")])
-def test_the_guide_names_the_distances_that_are_asked_for(profile, camera):
+def test_guide_asks_for_named_distances(profile, camera):
     rig = load_rig(profile)
     view = SensorPlace.nominal(rig, camera, next(iter(rig.lidars)))
     distance_m = np.linalg.norm(Planner(view).candidates[:, :3, 3], axis=1)
@@ -58,14 +58,14 @@ def test_every_candidate_is_seen_by_both_sensors(planner):
         assert planner.view.model.lens.is_inside(outline).all()
 
 
-def test_guided_placements_tell_more_than_random_ones(guided):
+def test_guided_placements_are_more_informative_than_random(guided):
     random = [sigmas(predict_covariance(model(), placements(12, seed), T_FORWARD)) for seed in range(5)]
     rotation, translation = sigmas(predict_covariance(model(), guided, T_FORWARD))
     assert rotation < 0.8 * np.median([each[0] for each in random])
     assert translation < 0.9 * np.median([each[1] for each in random])
 
 
-def test_the_wanted_placement_lowers_the_prediction(planner, guided):
+def test_target_placement_lowers_prediction(planner, guided):
     before, after = planner.guide(guided[:5]), planner.guide(guided[:6])
     rotation, translation = sigmas(predict_covariance(planner.view.model, guided[:6], T_FORWARD))
     assert after.sigma_rotation_deg == pytest.approx(np.degrees(rotation))
@@ -73,7 +73,7 @@ def test_the_wanted_placement_lowers_the_prediction(planner, guided):
     assert after.sigma_rotation_deg < before.sigma_rotation_deg
 
 
-def test_no_placement_is_asked_for_twice(guided):
+def test_planner_never_repeats_a_placement(guided):
     for k, T_cam_board in enumerate(guided):
         way_m = np.linalg.norm(guided[:k, :3, 3] - T_cam_board[:3, 3], axis=1)
         turn = guided[:k, :3, 2] @ T_cam_board[:3, 2]
@@ -81,14 +81,14 @@ def test_no_placement_is_asked_for_twice(guided):
         assert not np.any((way_m < 0.01) & (turn > 0.9999) & (roll > 0.9999))
 
 
-def test_what_cannot_be_reached_is_not_asked_for_again(planner):
+def test_planner_skips_unreachable_placement(planner):
     first = planner.guide(NONE).T_cam_board
     second = planner.guide(NONE, avoid=first[None]).T_cam_board
     assert np.linalg.norm(second[:3, 3] - first[:3, 3]) >= 0.4
     assert planner.guide(NONE, avoid=planner.candidates).T_cam_board is None
 
 
-def test_of_placements_nearly_as_good_the_nearest_is_taken(planner, guided):
+def test_planner_prefers_nearest_of_similar_placements(planner, guided):
     held = guided[:8]
     free = planner.guide(held).T_cam_board
     nearby = planner.guide(held, present=planner.candidates[3]).T_cam_board
@@ -140,7 +140,7 @@ def test_planner_no_rings_keeps_whole_plate():
     assert n_placed[0] > n_placed[1] > n_placed[2] > 0
 
 
-def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
+def test_planner_moves_person_away_from_capture(planner, guided):
     for k in range(1, len(guided)):
         present = guided[k - 1]
         wanted = planner.guide(guided[:k], present).T_cam_board
@@ -152,7 +152,7 @@ def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
     assert guidance.T_cam_board is not None
 
 
-def test_where_nothing_is_left_a_refusal_says_so(planner):
+def test_planner_without_placements_refuses_with_reason(planner):
     refusal = planner.adds_nothing(planner.candidates, planner.candidates[7])
     assert (refusal.figures["capture"], refusal.action) == ("8", "nowhere")
 
@@ -196,7 +196,7 @@ def coverage(planner, *changes):
     return measure_coverage(view(), np.array(poses).reshape(-1, 4, 4), planner.candidates)
 
 
-def test_nothing_is_covered_by_nothing_nor_by_one_board(planner):
+def test_coverage_of_one_board_is_zero(planner):
     assert coverage(planner) == Coverage(0, 0, 0, 0, 0)
     assert coverage(planner, {}) == Coverage(0, 0, 0, 0, 0)
 

@@ -33,7 +33,7 @@ def poses():
 
 
 @pytest.mark.parametrize("laser_m", [1e-6, 0.008])
-def test_prediction_is_the_covariance_of_the_calibration(poses, laser_m):
+def test_prediction_matches_calibration_covariance(poses, laser_m):
     scenario = Scenario(range_sigma_m=0.008, corner_sigma_px=0.05, laser_bias_sigma_m=laser_m)
     options = EstimateSettings(laser_bias_sigma_m=laser_m, range_offset_sigma_m=0.005)
     estimate = estimate_observations(observe(poses, 3, scenario), BOARD, options)
@@ -45,7 +45,7 @@ def test_prediction_is_the_covariance_of_the_calibration(poses, laser_m):
         assert 1 / 1.15 < expected / actual < 1.15
 
 
-def test_more_lasers_tell_more(poses):
+def test_precision_improves_with_more_lasers(poses):
     # 64 lasers are grouped by four, whose errors average out.
     elevations = [np.radians(np.linspace(-15.0, 15.0, n)) for n in (16, 64)]
     models = [replace(model(), elevations_rad=each) for each in elevations]
@@ -55,7 +55,7 @@ def test_more_lasers_tell_more(poses):
 
 
 @pytest.mark.long
-def test_predicted_scatter_is_that_of_many_sessions(poses):
+def test_predicted_scatter_matches_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.008, corner_sigma_px=0.05)
     estimates = [
         estimate_observations(observe(poses, seed, scenario), BOARD, EstimateSettings())

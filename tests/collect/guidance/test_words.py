@@ -40,14 +40,14 @@ def test_one_change_is_one_instruction(changes, text):
     assert words(**changes) == [text]
 
 
-def test_words_left_is_that_of_the_person():
+def test_instructions_left_is_the_persons_left():
     left = build_pose(VIEW, replace(HERE, right_m=0.6))
     pixels, _ = VIEW.model.lens.project(left[:3, 3])
     middle, _ = VIEW.model.lens.project(build_pose(VIEW, HERE)[:3, 3])
     assert pixels[0] > middle[0] + 100
 
 
-def test_a_top_towards_the_rig_is_nearer_to_it():
+def test_tilt_towards_rig_moves_top_closer():
     held = build_pose(VIEW, replace(HERE, tilt_deg=30.0))
     along = (held[:3, :3].T @ VIEW.up) * [1, 1, 0]
     top = held[:3, 3] + 0.3 * held[:3, :3] @ (along / np.linalg.norm(along))
@@ -65,19 +65,19 @@ def test_say_several_moves_gives_first():
     assert say({"sideways": "3 steps left", "tilt": "tilt the top towards the rig"}) == "3 steps left"
 
 
-def test_small_differences_are_not_mentioned():
+def test_instruct_ignores_small_differences():
     assert words(right_m=0.05, ahead_m=2.55, up_m=0.03, tilt_deg=4.0, turn_deg=-4.0, roll_deg=50.0) == []
     assert say({}) == "hold still"
 
 
-def test_a_print_turned_by_half_is_the_same_placement():
+def test_pattern_rotated_by_180_deg_is_same_placement():
     held = build_pose(VIEW, HERE)
     flipped = held @ np.diag([-1.0, -1.0, 1.0, 1.0])
     assert instruct(VIEW, flipped, held) == {}
     assert is_there(VIEW, flipped, held)
 
 
-def test_following_every_word_leads_there():
+def test_following_instructions_reaches_target():
     for present, wanted in zip(placements(12, 1), placements(12, 2), strict=True):
         there = describe_pose(VIEW, wanted)
         for _ in range(4):

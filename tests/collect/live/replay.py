@@ -16,7 +16,7 @@ PERIOD_NS = 100_000_000
 
 @cache
 def rig():
-    """Give the shipped event rig, whose small pictures are searched quickly."""
+    """Load the shipped event rig; its small images are searched quickly."""
     return load_rig("rles")
 
 

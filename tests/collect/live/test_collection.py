@@ -107,7 +107,7 @@ def test_collect_take_back_counts_correctly(tmp_path):
 
 
 @pytest.mark.long
-def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(tmp_path, monkeypatch):
+def test_pending_capture_can_be_taken_back(tmp_path, monkeypatch):
     states = []
     show = Show(placements()[:1], each_s=100.0)
 
@@ -235,7 +235,7 @@ def test_collect_more_than_enough_is_guided(met):
     assert said.endswith("14 captures")
 
 
-def test_who_wants_no_more_than_enough_is_done_at_once(met):
+def test_collect_ends_at_once_if_target_is_met(met):
     show = Show(placements()[:1], each_s=2.0)
     with show.running(), Session.open(met, writable=True) as session:
         report = collect_live(session, show.sources, replace(QUICK, n_wanted=None))

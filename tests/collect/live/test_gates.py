@@ -49,7 +49,7 @@ def test_gate_early_moved_board_is_skipped():
     assert taken == [14 + 12]
 
 
-def test_what_is_said_counts_the_hold_down_and_then_goes_on():
+def test_gate_narration_counts_down_then_continues():
     (guide,) = make_guides(rig())
     guide.plan(None, 0.0)
     gate = StillBoards(rig(), HOLD_S)

@@ -215,7 +215,7 @@ def test_walk_continued_gets_new_placements():
 
 
 @pytest.mark.long
-def test_half_a_room_and_a_careless_person_will_do():
+def test_guide_succeeds_in_half_a_room():
     careless = Person(place_sigma_m=0.2, turn_sigma_deg=15.0, ignored_share=0.5)
 
     def is_left(T_cam_board):

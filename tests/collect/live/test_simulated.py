@@ -36,7 +36,7 @@ def walk(scene, view, wanted):
     return invert(T_world_cam) @ scene.T_world_board, now_s - 100.0
 
 
-def test_the_person_walks_to_where_the_board_is_wanted(scene, view):
+def test_person_walks_to_target_placement(scene, view):
     reached, took_s = walk(scene, view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     wanted = build_pose(view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     assert np.linalg.norm(reached[:3, 3] - wanted[:3, 3]) < 0.15

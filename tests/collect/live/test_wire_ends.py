@@ -48,7 +48,7 @@ def test_signals_end_a_collection_cleanly(wire, tmp_path, number, code):
 
 
 @pytest.mark.long
-def test_a_collection_that_is_killed_loses_no_capture(wire, tmp_path):
+def test_killed_collection_loses_no_capture(wire, tmp_path):
     rig, session, said = wire(), tmp_path / "session", list[str]()
     chance = random.Random(0)
     for turn in range(3):

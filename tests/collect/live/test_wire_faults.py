@@ -98,7 +98,7 @@ def test_collect_counter_jump_uses_arrival(wire, reel, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("set_s", [-3600, 3600], ids=["back", "forward"])
-def test_a_computer_whose_clock_is_set_goes_on(wire, reel, tmp_path, set_s):
+def test_collect_continues_after_clock_change(wire, reel, tmp_path, set_s):
     rig, file = wire(), tmp_path / "set"
     prelude = SET_CLOCK.format(set_ns=set_s * 10**9, file=str(file))
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0", prelude=prelude) as collecting:
@@ -143,7 +143,7 @@ def test_collect_recording_disk_full_exits_5(wire, tmp_path):
 
 
 @pytest.mark.long
-def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(wire, tmp_path, monkeypatch):
+def test_guidance_continues_during_slow_write(wire, tmp_path, monkeypatch):
     rig = wire()
     flush, begun_s, states_s = os.fsync, [], []
 

@@ -43,7 +43,7 @@ class TriggeringBoard(FakeBoard):
 
 
 @pytest.mark.long
-def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(wire, reel, tmp_path):
+def test_pulses_synchronise_images_with_lidar(wire, reel, tmp_path):
     trigger = tmp_path / "trigger"
     os.mkfifo(trigger)
     with TriggeringBoard(trigger) as board:

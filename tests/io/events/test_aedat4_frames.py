@@ -78,7 +78,7 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path):
 
 
 @pytest.mark.dataset
-def test_a_real_davis_file_is_read_as_its_makers_read_it(recordings):
+def test_real_davis_file_equals_vendor_reader(recordings):
     dv = pytest.importorskip("dv_processing")
     path = recordings / "events" / "davis346_short.aedat4"
     truth = dv.io.MonoCameraRecording(str(path))

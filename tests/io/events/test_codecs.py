@@ -27,7 +27,7 @@ def columns_listed(columns):
     cuts=st.lists(st.integers(0, 300), max_size=6),
     start_us=st.integers(0, 1 << 23),
 )
-def test_streams_come_back_however_they_are_cut_into_blocks(n, seed, cuts, start_us):
+def test_codecs_ignore_block_boundaries(n, seed, cuts, start_us):
     truth = listed(random_events(n, seed, (1280, 720), start_us))
     words = np.frombuffer(encoders.evt3(truth), "<u2")
     decoder = WordDecoder(EVT3)
@@ -35,14 +35,14 @@ def test_streams_come_back_however_they_are_cut_into_blocks(n, seed, cuts, start
     assert columns_listed(join_events(parts)) == truth
 
 
-def test_a_vector_of_evt3_goes_on_where_the_last_one_ended():
+def test_evt3_vector_continues_after_previous_one():
     # Base 100, then 12 + 12 + 8 places, of which the first of each is set.
     words = [8 << 12, 6 << 12 | 5, 7, 3 << 12 | 1 << 11 | 100, 4 << 12 | 1, 4 << 12 | 1, 5 << 12 | 1]
     events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
     assert columns_listed(events) == [(5, 100, 7, True), (5, 112, 7, True), (5, 124, 7, True)]
 
 
-def test_clocks_of_the_sensor_wrap_without_a_trace():
+def test_codecs_sensor_clock_wraps_seamlessly():
     truth = listed(random_events(400, 1, (640, 480), (1 << 24) - 400))
     assert truth[0][0] < 1 << 24 < truth[-1][0]
     assert columns_listed(WordDecoder(EVT3).decode(np.frombuffer(encoders.evt3(truth), "<u2"))) == truth
@@ -98,7 +98,7 @@ def test_event_arrays_are_what_ros_itself_reads(is_ros1):
 
 
 @given(data=st.binary(max_size=200), is_ros1=st.booleans())
-def test_rubbish_is_refused_in_words_and_nothing_else(data, is_ros1):
+def test_codecs_garbage_is_refused_with_message(data, is_ros1):
     for decode in (parsed, lambda data, is_ros1: decode_event_array(data, "ros1" if is_ros1 else "cdr")):
         try:
             decode(data, is_ros1)

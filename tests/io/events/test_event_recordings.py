@@ -22,7 +22,7 @@ def columns(path):
 
 
 @pytest.mark.parametrize("name", ["davis346_short.aedat4", "dvs_320x240.aedat4"])
-def test_aedat4_is_read_as_its_makers_read_it(folder, name):
+def test_aedat4_equals_vendor_reader(folder, name):
     dv = pytest.importorskip("dv_processing")
     recording = dv.io.MonoCameraRecording(str(folder / name))
     batches = []

@@ -207,7 +207,7 @@ def test_hdf5_links_inside_the_file_are_followed(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.bag", "a.raw", "a.mp4"])
-def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path, name):
+def test_event_files_garbage_is_refused_in_one_line(tmp_path, name):
     for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
         (tmp_path / name).write_bytes(rubbish)
         with pytest.raises(SourceError, match=name) as caught:
@@ -241,7 +241,7 @@ def test_damaged_events_are_read_or_refused_in_one_line(tmp_path_factory, name, 
         assert "\n" not in error.what
 
 
-def test_a_long_recording_is_never_in_memory_as_a_whole(tmp_path):
+def test_long_event_recording_is_streamed(tmp_path):
     piece = random_events(20_000, 1)
     span_ns = int(piece.t_ns[-1])
     pieces = (

@@ -1,4 +1,4 @@
-"""Pictures for people: what must be drawn, what must not, and that sizes and files are right."""
+"""Overlay images: drawn and omitted marks, sizes and files."""
 
 import cv2
 import numpy as np
@@ -112,7 +112,7 @@ def test_near_points_cover_far_ones():
 
 @pytest.mark.parametrize("has_image", [True, False])
 @pytest.mark.parametrize("has_lidar", [True, False])
-def test_a_debug_picture_is_made_of_whatever_there_is(has_image, has_lidar):
+def test_debug_image_is_drawn_from_available_data(has_image, has_lidar):
     points = wall()
     refusal = IMAGE_TILTED.refusal(tilt_deg=71.0, max_tilt_deg=70.0, turn_deg=6.0)
     drawn = draw_debug(

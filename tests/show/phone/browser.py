@@ -41,7 +41,7 @@ class Browser:
         self._line = Line(self._loop, self._connect(path))
 
     def open(self, url, width=1280, height=720, first=""):
-        """Open a page; `first` is run before its own scripts."""
+        """Open a page; `first` runs before the page's scripts."""
         context = self._line.call("Target.createBrowserContext")["browserContextId"]
         target = self._line.call("Target.createTarget", url="about:blank", browserContextId=context)
         page = Page(self._loop, self._connect(f"/devtools/page/{target['targetId']}"))
@@ -183,7 +183,7 @@ class Page(Line):
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 
     def screenshot(self):
-        """Take a picture of the page, BGR."""
+        """Take a screenshot of the page, BGR."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return np.asarray(picture, np.uint8)

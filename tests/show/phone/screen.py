@@ -1,4 +1,4 @@
-"""What a page shows, as expressions that can be waited for."""
+"""Visible states of a page, as expressions to wait for."""
 
 from .conftest import state
 

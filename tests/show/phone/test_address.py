@@ -22,7 +22,7 @@ from .conftest import port_of
         (" localhost ", "localhost", 8765),
     ],
 )
-def test_addresses_are_read_as_people_write_them(text, host, port):
+def test_preview_addresses_accept_common_forms(text, host, port):
     assert parse_address(text) == (host, port)
 
 
@@ -31,13 +31,13 @@ def test_addresses_are_read_as_people_write_them(text, host, port):
     ["host:port", "host:70000", "1:2:3", "::1", "[::1]:9000", "http://host:1", "a b", "host:-1", "host:8_0",
      "host:٣"],
 )  # fmt: skip
-def test_what_is_no_address_is_refused_with_examples(text):
+def test_preview_invalid_address_is_refused_with_examples(text):
     with pytest.raises(UsageError) as caught:
         parse_address(text)
     assert "0.0.0.0:8765" in caught.value.hint
 
 
-def test_a_port_in_use_is_said_to_be():
+def test_preview_port_in_use_is_reported():
     with Preview(port=0) as first:
         port = port_of(first)
         with pytest.raises(UsageError):

@@ -1,4 +1,4 @@
-"""Pages that sleep or fail: the others go on, and so does the collection."""
+"""Pages that sleep or fail affect neither other pages nor the collection."""
 
 import time
 
@@ -14,7 +14,7 @@ from .watcher import Watcher
 pytestmark = pytest.mark.realtime
 
 
-def test_a_page_that_shows_nothing_makes_way(preview, monkeypatch):
+def test_idle_page_connection_is_replaced(preview, monkeypatch):
     monkeypatch.setattr(pages, "ANSWER_S", 3.0)
     with Watcher(preview.urls[0]) as asleep, Watcher(preview.urls[0]) as awake:
         asleep.watch()

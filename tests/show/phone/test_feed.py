@@ -94,7 +94,7 @@ def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
     ["", "no json", "[]", "{}", '{"visible": 1}', "true", "[" * 200, "x" * 5000,
      '{"take_back": 6}', '{"take_back": "../../etc"}', '{"take_back": ""}', "7", '"take_back"'],
 )  # fmt: skip
-def test_what_no_page_sends_ends_its_connection_only(preview, text):
+def test_invalid_message_ends_only_its_connection(preview, text):
     with Watcher(preview.urls[0]) as odd, Watcher(preview.urls[0]) as other:
         odd.watch()
         odd.send(text)
@@ -106,7 +106,7 @@ def test_what_no_page_sends_ends_its_connection_only(preview, text):
         assert other.next_state()[0]["n_captures"] == 7
 
 
-def test_noise_on_the_port_is_survived_in_silence(preview, caplog):
+def test_port_noise_is_ignored(preview, caplog):
     port = port_of(preview)
     random = np.random.default_rng(1)
     said = [random.bytes(300) for _ in range(20)]

@@ -10,7 +10,7 @@ from .screen import OPEN, has_text, shown
 pytestmark = pytest.mark.realtime
 
 
-def test_it_says_that_the_line_is_lost_and_finds_back(browser):
+def test_page_reports_lost_connection_and_reconnects(browser):
     first = Preview(port=0, token="one-token")
     page = browser.open(first.start())
     port = port_of(first)
@@ -28,12 +28,12 @@ def test_it_says_that_the_line_is_lost_and_finds_back(browser):
         page.wait_until(OPEN)
         shown(second, page, has_text("count", "8"), n_captures=8)
         assert not page.evaluate(is_lost)
-    # Nothing but the attempts that found nobody.
+    # Only failed connection attempts.
     assert all(each.startswith("network: WebSocket") for each in page.complaints)
 
 
 @pytest.mark.long
-def test_a_line_that_falls_silent_is_opened_anew(preview, browser):
+def test_page_reconnects_silent_connection(preview, browser):
     counting = """
       const Plain = WebSocket;
       window.lines = [];
@@ -42,7 +42,7 @@ def test_a_line_that_falls_silent_is_opened_anew(preview, browser):
     """
     page = browser.open(preview.urls[0], first=counting)
     shown(preview, page, has_text("count", "7"))
-    # What arrives goes nowhere, as with a phone out of range.
+    # Received data are dropped, as with a phone out of range.
     page.evaluate("window.lines[0].onmessage = null")
     page.wait_until("window.lines.length === 2")
     shown(preview, page, has_text("count", "9"), n_captures=9)
@@ -56,7 +56,7 @@ def test_page_shows_no_news_and_the_end(browser):
     shown(preview, page, "document.getElementById('banner').hidden", phase="ended")
     page.wait_until("document.body.dataset.phase === 'ended'")
     preview.close()
-    # The end is no failure: the last state stays, without outlines that nobody should follow.
+    # The end is not a failure: the last state stays, without outlines to follow.
     page.wait_until("document.body.dataset.connection === 'over'")
     assert page.evaluate("document.getElementById('banner').hidden")
     assert page.text("count") == "7"
@@ -64,7 +64,7 @@ def test_page_shows_no_news_and_the_end(browser):
 
 
 @pytest.mark.long
-def test_an_old_link_is_said_to_be_old(browser):
+def test_page_reports_outdated_link(browser):
     first = Preview(port=0, token="first-token")
     page = browser.open(first.start())
     shown(first, page, has_text("count", "7"))

@@ -13,7 +13,7 @@ from .screen import has_text, shown
 
 pytestmark = pytest.mark.realtime
 SIZES = [(360, 640), (640, 360), (1280, 720)]
-# Where the points of an outline lie on the screen.
+# Positions of an outline's points on the screen.
 _ON_SCREEN = """(() => {
   const path = document.querySelector('#%s .ink');
   const matrix = path.getScreenCTM();
@@ -25,7 +25,7 @@ _ON_SCREEN = """(() => {
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_state_is_on_the_screen_whole(preview, browser, width, height):
+def test_page_shows_complete_state(preview, browser, width, height):
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, has_text("headline", "one step left, 0.5 m closer"))
     assert page.text("phase") == "move"
@@ -74,7 +74,7 @@ def _compare_with_picture(page, is_mirrored):
     wanted = np.array(page.evaluate(_ON_SCREEN % "wanted"))
     page.evaluate("document.querySelectorAll('#outlines, #legend').forEach((each) => each.style.opacity = 0)")
     screen = cv2.cvtColor(page.screenshot(), cv2.COLOR_BGR2GRAY)
-    # The bright square of the picture, as the browser painted it.
+    # The bright square of the image, as rendered by the browser.
     left, top = np.floor(found.min(axis=0)).astype(int) - 15
     right, bottom = np.ceil(found.max(axis=0)).astype(int) + 15
     rows, columns = np.nonzero(screen[top:bottom, left:right] > 130)
@@ -82,7 +82,7 @@ def _compare_with_picture(page, is_mirrored):
         [columns.min() + left, rows.min() + top, columns.max() + left + 1, rows.max() + top + 1]
     )
     assert np.abs(painted - np.concatenate([found.min(axis=0), found.max(axis=0)])).max() <= 1.5
-    # The whole picture fits, and both outlines share its scale.
+    # The whole image is visible, and both outlines have its scale.
     scale = np.ptp(found, axis=0) / np.ptp(PRESENT_PX, axis=0)
     assert np.allclose(scale, scale[0])
     assert np.allclose(np.ptp(wanted, axis=0), scale * np.ptp(WANTED_PX, axis=0))
@@ -94,7 +94,7 @@ def _compare_with_picture(page, is_mirrored):
 def test_arrow_ends_when_the_board_is_there(preview, browser):
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
-    # From (150, 130) towards (480, 180), whose outline begins at x = 400.
+    # From (150, 130) towards (480, 180), whose outline starts at x = 400.
     shown(preview, page, f"{tip}?.startsWith('M400 167.8')")
     near = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + [40.0, 0.0])
     shown(preview, page, f"{tip} === 'M190 130'", drawing=near)
@@ -128,7 +128,7 @@ def test_the_countdown_runs_while_the_board_is_held(preview, browser):
     assert page.evaluate("document.body.dataset.phase") == "saving"
 
 
-def test_what_sensors_say_is_text_and_not_markup(preview, browser):
+def test_sensor_messages_are_escaped(preview, browser):
     page = browser.open(preview.urls[0])
     evil = "<img src=x onerror=alert(1)><b>bold</b>"
     stream = StreamState(evil, reason=evil, figures=evil)

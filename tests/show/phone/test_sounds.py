@@ -44,7 +44,7 @@ def test_sounds_are_played_once_each_after_a_tap(preview, browser):
 
 @pytest.mark.long
 def test_voice_reads_settled_words_once(preview, browser):
-    # Headless browsers have no voices: this one remembers what it is told to say.
+    # Headless browsers have no voices: this one records the text.
     listening = """
       window.said = [];
       const voice = {

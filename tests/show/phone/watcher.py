@@ -9,7 +9,7 @@ import aiohttp
 
 
 class Watcher:
-    """One client with its own cookies; closed at the end of its `with` block."""
+    """One client with separate cookies; closed at the end of its `with` block."""
 
     def __init__(self, url):
         self.url, _, query = url.partition("?")
@@ -44,7 +44,7 @@ class Watcher:
         return message.data if message.type is aiohttp.WSMsgType.CLOSE else self.socket.close_code
 
     def receive_all(self, quiet_s):
-        """Give what comes until nothing has come for so long, without beats."""
+        """Return messages, without beats, until none arrives for this time."""
         found = []
         while True:
             try:
@@ -57,7 +57,7 @@ class Watcher:
                 found.append(message)
 
     def next_state(self, visible=True):
-        """Give the next state and its picture, and answer that it is on the screen."""
+        """Return the next state and its image, and acknowledge them."""
         while "beat" in (state := self.receive()):
             self.answer(visible)
         has_picture = state["drawing"] is not None and state["drawing"]["has_picture"]

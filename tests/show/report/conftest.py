@@ -23,7 +23,7 @@ TWO = load_rig(str(Path(__file__).parents[2] / "rigs" / "two_cameras.yaml"))
 
 @pytest.fixture(scope="session")
 def page(tmp_path_factory):
-    """Write the report of results of a rig, whose session holds an even image of each camera."""
+    """Write the report of a rig's results, with a session of one uniform image per camera."""
 
     def write(rig, *calibrations, **options):
         path = tmp_path_factory.mktemp("report") / "s"

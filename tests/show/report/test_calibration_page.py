@@ -33,7 +33,7 @@ def test_page_is_small_and_self_contained(which, request):
 
 def test_every_capture_s_marks_lead_to_its_overlay(one, one_page):
     for k, residual in enumerate(one.residuals):
-        # Outline, plate from above, residual by range, picture; and the table.
+        # Outline, plate from above, residual by range, image; and the table.
         assert one_page.count(f'href="#pair-0-capture-{k}"') == 5
         assert f'src="overlays/{residual.capture}.png"' in one_page
 

@@ -14,7 +14,7 @@ def test_it_fits_the_screen_and_loads_nothing(browser, tmp_path, request, which,
     file.write_text(request.getfixturevalue(which), encoding="utf-8")
     page = browser.open(file.as_uri(), width_px, 844)
     assert page.evaluate("document.documentElement.scrollWidth") == width_px
-    # A colour bar is a picture within the page.
+    # A colour bar is an image within the page.
     requested = [address for address in page.requested if not address.startswith("data:")]
     assert requested == [file.as_uri()]
     assert page.complaints == []

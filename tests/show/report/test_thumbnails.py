@@ -1,4 +1,4 @@
-"""Pictures of captures on the page: small for any image, outline on the board, largest residuals first."""
+"""Thumbnails on the page: small for any image, outline on the board, largest residuals first."""
 
 import base64
 import re
