@@ -32,6 +32,7 @@ from lce_rig.pipeline.findings import CHANNEL_REJECTED, FEW_DETECTED, absent_cha
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
+from lce_rig.show.overlays.canvas import Thumbnails
 from lce_rig.show.tables import result_tables, rig_table
 
 _AXES = ("x right", "y down", "z forward")
@@ -183,8 +184,9 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
+    thumbnails: Thumbnails = {}
     with show.progress_bar("detecting") as progress:
-        detections = lce.detect_boards(opened, progress=progress)
+        detections = lce.detect_boards(opened, progress=progress, thumbnails=thumbnails)
     show.warn_of(unlike_models(opened, detections))
     for absent in chain(*absent_channels(rig, detections, channels).values()):
         show.warn(f"{absent.text}: {absent.advice_at(str(session))}")
@@ -198,6 +200,7 @@ def calibrate(
                 channels=channels,
                 reference=truth,
                 progress=progress,
+                thumbnails=thumbnails,
             )
         except NotEnoughDataError as error:
             if error.finding is not None and error.finding.figures.get("where"):

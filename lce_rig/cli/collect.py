@@ -25,7 +25,7 @@ from lce_rig.io.recording import SourceOptions
 from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
-from lce_rig.show.phone.preview import DEFAULT_PORT, LOOPBACK
+from lce_rig.show.phone import DEFAULT_PORT, LOOPBACK
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:

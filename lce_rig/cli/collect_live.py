@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -19,10 +20,12 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices import open_live
 from lce_rig.rig import Rig
 from lce_rig.session import Session, discard_if_empty
-from lce_rig.show.phone.preview import Preview, parse_address
 from lce_rig.show.screen.keys import Controls, controls
 from lce_rig.show.screen.live_view import open_view, qr_lines
 from lce_rig.simulate import SimulationOptions, rig_truth
+
+if TYPE_CHECKING:
+    from lce_rig.show.phone.preview import Preview
 
 #: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
 #: rig without a terminal may be away for a while.
@@ -134,8 +137,10 @@ def _session(path: Path, rig: Rig) -> Iterator[Session]:
         raise
 
 
-def _open_page(stack: ExitStack, address: str) -> Preview:
+def _open_page(stack: ExitStack, address: str) -> "Preview":
     """Serve the preview page and print its link."""
+    from lce_rig.show.phone.preview import Preview, parse_address  # aiohttp takes 0.2 s to import
+
     page = Preview(*parse_address(address))
 
     def tell_failure() -> None:

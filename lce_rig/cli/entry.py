@@ -1,5 +1,6 @@
 """Entry point of the installed command: Ctrl-C and the memory limit come before any other import."""
 
+import gc
 import os
 import resource
 import sys
@@ -23,6 +24,8 @@ def main() -> None:
         limit_opencv()
         # Its matrices are small: threads of BLAS would only wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # Net number of new objects between searches for cycles: imports alone make 1e5, without cycles.
+        gc.set_threshold(20_000, 20, 20)
         from lce_rig.cli.main import run
 
         code = run(sys.argv[1:])

@@ -15,7 +15,7 @@ import click
 import yaml
 
 from lce_rig.core.findings import Finding
-from lce_rig.core.progress import Progress
+from lce_rig.core.progress import Progress, silent
 
 if TYPE_CHECKING:
     from lce_rig.show.tables import Table
@@ -208,16 +208,15 @@ def progress_bar(title: str, *, has_lines: bool = False) -> Iterator[Progress]:
         title: title of the work.
         has_lines: prints lines if stderr is not a terminal; by default, it gets nothing then.
     """
+    if not sys.stderr.isatty():
+        yield ProgressLines(title) if has_lines else silent
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-    console = Console(stderr=True)
-    if has_lines and not console.is_terminal:
-        yield ProgressLines(title)
-        return
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         yield ProgressBar(bar, title)
 
 

@@ -26,6 +26,7 @@ class Image:
         host_ns: arrival at the host; None if unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
         count: the camera's running number of the image; gaps are lost ones; None if it does not count.
+        png: the file of the pixels, which a session keeps unchanged; None encodes them.
     """
 
     sensor: str
@@ -34,6 +35,7 @@ class Image:
     pixels: NDArray[np.uint8]
     host_ns: int | None = None
     count: int | None = None
+    png: bytes | None = None
 
     @property
     def grey(self) -> NDArray[np.uint8]:

@@ -56,6 +56,12 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     return to_8_bit(decode_pixels(data, flags))
 
 
+def is_plain_png(data: bytes) -> bool:
+    """Return whether a file that was decoded is a PNG of 8-bit grey or colour, without transparency."""
+    is_plain = data.startswith(b"\x89PNG") and data[24] == 8 and data[25] in (0, 2)
+    return is_plain and b"tRNS" not in data[: data.find(b"IDAT")]
+
+
 @np.errstate(invalid="ignore")  # of signalling NaN
 def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Convert pixels to 8 bits; deeper images are stretched between their darkest and brightest percent.

@@ -12,13 +12,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.bounds import MAX_BYTES
+from lce_rig.core.bounds import MAX_BYTES, decoding
 from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
+from lce_rig.io.decoding import DECODERS, SUFFIXES, decode_image, is_plain_png, read_cloud, require_las
 from lce_rig.io.findings import NOT_DECODED, worded
 from lce_rig.io.recording import (
     SourceOptions,
@@ -221,7 +221,11 @@ class FileOnDisk:
         Raises:
             SourceError: it is missing, empty, truncated or damaged.
         """
-        return Image(self.sensor, self.channel, self.stamp_ns, read_image(self.path))
+        with reading(self.path, most_bytes=MAX_BYTES), decoding():
+            data = self.path.read_bytes()
+            pixels = decode_image(data)
+        png = data if is_plain_png(data) else None
+        return Image(self.sensor, self.channel, self.stamp_ns, pixels, png=png)
 
 
 @dataclass(frozen=True)

@@ -159,6 +159,7 @@ def calibrate_session(
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
+    thumbnails: Thumbnails | None = None,
 ) -> Result:
     """Estimate and judge the extrinsics of every camera with every LiDAR, and of every two LiDARs.
 
@@ -172,15 +173,17 @@ def calibrate_session(
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each camera and LiDAR in turn.
+        thumbnails: of `detect_boards`, for the report; missing ones are decoded again.
 
     Raises:
         NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
             named.
         UsageError: no capture holds one of the channels.
     """
+    thumbnails = {} if thumbnails is None else thumbnails
     session = session if isinstance(session, Session) else Session.open(session)
     if detections is None:
-        detections = detect_boards(session)
+        detections = detect_boards(session, thumbnails=thumbnails)
     calibrations, shortages = calibrate_detections(
         session.rig,
         detections,
@@ -190,7 +193,7 @@ def calibrate_session(
         progress=progress,
     )
     begin(progress, "comparing with the scene")
-    judged, thumbnails = [], Thumbnails()
+    judged = []
     for c in calibrations:
         truth = None if reference is None else reference.of(c.camera, c.lidar)
         if truth is not None:

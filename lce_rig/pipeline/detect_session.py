@@ -31,6 +31,7 @@ from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
 from lce_rig.session.durable import load_arrays, store_arrays
+from lce_rig.show.overlays.canvas import Thumbnails, reduced
 
 Key = tuple[str, str]
 _ImageJob = tuple[Capture, str, str]
@@ -44,6 +45,7 @@ def detect_boards(
     *,
     progress: Progress = silent,
     n_threads: int = 2,
+    thumbnails: Thumbnails | None = None,
 ) -> Detections:
     """Find the board in all samples of a session, or read earlier detections from the cache.
 
@@ -56,8 +58,9 @@ def detect_boards(
         session: open for reading is enough.
         progress: called with (done, total).
         n_threads: detectors that run in parallel.
+        thumbnails: receives the images that were decoded.
     """
-    finder = _Finder(session)
+    finder = _Finder(session, thumbnails)
     scan_jobs, image_jobs, event_jobs = finder.jobs(session.captures)
     n_scans, total = len(scan_jobs), len(scan_jobs) + len(image_jobs) + len(event_jobs)
     images: dict[Key, dict[str, ImageDetection]] = {}
@@ -137,8 +140,9 @@ def event_picture(session: Session, capture: Capture, camera: str, channel: str)
 class _Finder:
     """Detects boards and stores the detections in the session's cache."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, thumbnails: Thumbnails | None = None) -> None:
         self._session = session
+        self._thumbnails = {} if thumbnails is None else thumbnails
         self._boards = BoardFinder(session.rig)
         self._digest = detection_digest(session.rig)
         # Images depend on the network, too.
@@ -175,8 +179,10 @@ class _Finder:
         """Find the board in an image that the capture holds."""
 
         def find() -> ImageDetection:
+            image = capture.image(camera, channel)
+            self._thumbnails[capture.name, camera, channel] = reduced(image.pixels)
             try:
-                return self._boards.image(capture.image(camera, channel))
+                return self._boards.image(image)
             except ProfileError as error:
                 return refusal_of("image", error)
 

@@ -131,7 +131,7 @@ def set_stage(
         rig: the profile.
         seed: random seed of the session.
         options: `SimulationOptions.for_rig` of the rig by default.
-        is_draft: whether to render the room without anti-aliasing, in two thirds of the time.
+        is_draft: whether to render the room at half the resolution, in a sixth of the time.
 
     Raises:
         ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.

@@ -63,6 +63,21 @@ def test_collect_pairs_second_run_adds_none(tmp_path, folder, rig):
     assert [e["event"] for e in session.read_journal()][-1] == "collected"
 
 
+def test_collect_pairs_keeps_plain_png_files(tmp_path, folder, rig):
+    pictures = sorted((folder / "img").iterdir())
+    grey = cv2.imread(str(pictures[0]), cv2.IMREAD_GRAYSCALE)
+    transparent = cv2.merge([grey, grey, grey, grey])
+    for path, pixels in zip(pictures[1:], (transparent, grey.astype(np.uint16) * 16), strict=False):
+        cv2.imwrite(str(path), pixels)
+    read = [pair.read()[0][0].pixels for pair in open_recording(folder, rig).pairs]
+    with Session.create(tmp_path / "s", rig) as session:
+        run(session, folder, rig)
+    for k, (path, capture) in enumerate(zip(pictures, session.captures, strict=True)):
+        (stored,) = capture.path.glob("*.png")
+        assert (stored.read_bytes() == path.read_bytes()) == (k not in (1, 2))
+        assert np.array_equal(capture.image(*capture.image_keys[0]).pixels, read[k])
+
+
 def test_a_rejected_pair_is_not_collected_again(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         run(session, folder, rig)

@@ -325,13 +325,13 @@ def sum_products(terms: Terms, levels: Levels) -> Summed:
 def _sum(terms: Terms, parts: Sequence[Products]) -> Summed:
     """Sum the products of some parts."""
     trust, size = terms.trust, terms.state.layout.row.size
-    shape, log_volume = (len(trust), size, size), 0.0
-    M = np.zeros(len(trust) * size**2)
+    M, log_volume = np.zeros(len(trust) * size**2), 0.0
     for part in parts:
-        at = np.ravel_multi_index(_places(part), shape)
+        capture, row, column = _places(part)
+        at = (capture * size + row) * size + column
         M += np.bincount(at.ravel(), part.products.ravel(), len(M))
         log_volume += float(trust[part.capture] @ part.log_volume)
-    return Summed(M.reshape(shape) * trust[:, None, None], log_volume)
+    return Summed(M.reshape(-1, size, size) * trust[:, None, None], log_volume)
 
 
 def _reduce(terms: Terms, summed: Summed, levels: Levels, priors: Priors) -> Reduced:

@@ -14,10 +14,8 @@ from aiohttp import web
 
 from lce_rig.collect.live.state import LiveState, TakeBack
 from lce_rig.core.errors import UsageError
+from lce_rig.show.phone import DEFAULT_PORT, LOOPBACK
 from lce_rig.show.phone.pages import Feed, Pages
-
-LOOPBACK = "127.0.0.1"
-DEFAULT_PORT = 8765
 
 _HINT = (
     "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080: an address of this computer "
