@@ -70,9 +70,10 @@ def causes(observations, method="ml"):
     return [each.gain.cause for each in explained(observations, method)]
 
 
-def test_explain_sound_captures_finds_nothing():
-    found = [causes(observed(16, seed)) for seed in range(8)]
-    assert found == [[]] * 8
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 8), marks=pytest.mark.long)])
+def test_explain_sound_captures_finds_nothing(seeds):
+    found = [causes(observed(16, seed)) for seed in seeds]
+    assert found == [[]] * len(seeds)
 
 
 @pytest.mark.parametrize("method", ["ml", "paper"])

@@ -46,7 +46,8 @@ def test_four_sensors_loops_close(sound):
         assert np.allclose(closed, T[camera, "rear"], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["right", pytest.param("rear", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["right", "rear"])
 def test_sensor_that_moved_is_named_and_others_pass(name):
     after = perturb(ON_FRONT[name], np.r_[0.01, 0.0, 0.01, np.radians([0.6, 0.0, 0.8])])
     moves = {name: lambda k: ON_FRONT[name] if k < N // 2 else after}
@@ -59,6 +60,7 @@ def test_sensor_that_moved_is_named_and_others_pass(name):
             assert results[pair].verdict == "pass"
 
 
+@pytest.mark.long
 def test_exchanged_lidars_are_named_in_all_pairs():
     found = simulate(N, 1)
     front, rear = found.lidars["front"], found.lidars["rear"]
@@ -67,6 +69,7 @@ def test_exchanged_lidars_are_named_in_all_pairs():
         assert len(texts) == 1 and "front and rear are exchanged" in texts[0]
 
 
+@pytest.mark.long
 def test_moved_sensor_is_named_where_a_pair_saw_little_of_it():
     """The cameras have one and two captures from before the motion, and one result does not use its own."""
     after = perturb(ON_FRONT["rear"], np.r_[0.012, -0.004, 0.016, np.radians([0.5, 0.6, -0.6])])
@@ -79,6 +82,7 @@ def test_moved_sensor_is_named_where_a_pair_saw_little_of_it():
     assert verdicts == {"rear": ["pass", "fail", "fail"], "others": ["pass", "pass"]}
 
 
+@pytest.mark.long
 def test_sensor_on_another_clock_is_named_once():
     """Scans of `rear` are those of the next capture."""
     found = simulate(N, 3)

@@ -80,6 +80,7 @@ def test_the_echo_of_a_person_counts_by_itself():
     assert found.edge_shift_blended_echo_m == pytest.approx(-0.02, abs=0.008)
 
 
+@pytest.mark.long
 def test_background_without_effect_is_unused():
     """Backgrounds of any brightness and distance, wide steps, lost returns: and no effect on the edges."""
     scenario = Scenario(step_deg=0.4, footprint_m=0.008, lost_share=0.2)
