@@ -130,6 +130,7 @@ def test_a_channel_that_is_followed_is_compensated_alone():
     assert np.all(errors(result.T_cam_lidar) < [0.1, 4.0])
 
 
+@pytest.mark.long
 def test_motion_profile_offset_is_subtracted():
     captures = simulate_moving(25, 2, TRACKED)
     clocks = Clocks(channel_offset_s=dict(TRACKED.offset_s))

@@ -93,6 +93,7 @@ def test_the_lidar_does_not_move_the_lens(captures):
     assert np.abs(shift[3:]).max() < np.radians(0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["ml", "paper"])
 def test_lens_change_moves_extrinsics(captures, method):
     estimate = fit_extrinsic(captures, BOARD, replace(of_profile(ROUGH), method=method))

@@ -136,6 +136,7 @@ def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated_few
     assert not any(figures["was_used"] for figures in pair["captures"].values())
 
 
+@pytest.mark.long
 def test_calibrate_failed_keeps_old_result(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
     folder = calibrated_few / "calibration"

@@ -76,7 +76,7 @@ def test_explain_sound_captures_finds_nothing(seeds):
     assert found == [[]] * len(seeds)
 
 
-@pytest.mark.parametrize("method", ["ml", "paper"])
+@pytest.mark.parametrize("method", ["ml", pytest.param("paper", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
@@ -102,6 +102,7 @@ def test_explain_two_boards_are_named():
     assert float(found.gain.value[0]) == pytest.approx(0.1, abs=0.03)
 
 
+@pytest.mark.long
 def test_explain_drift_is_named():
     observations = [
         seen_at(o, perturb(np.eye(4), np.array([0, 0, 0, np.radians(0.1 * k), 0, 0])) @ o.image.T_cam_board)

@@ -109,6 +109,7 @@ def test_cameras_without_a_common_board_share_the_lidar(session):
         assert own.other_cameras == ()
 
 
+@pytest.mark.long
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
@@ -117,7 +118,9 @@ def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     assert "4 of 12" in other
 
 
-@pytest.mark.parametrize("options", [ML, PAPER], ids=["ml", "paper"])
+@pytest.mark.parametrize(
+    "options", [pytest.param(ML, id="ml"), pytest.param(PAPER, id="paper", marks=pytest.mark.long)]
+)
 def test_nudged_camera_is_named_and_the_other_kept(options):
     found = calibrated(detections(simulate_two(12, 1, nudge=TURNED, nudged_from=6)), options)
     assert [own.estimated_with for own in found.values()] == [(), ()]

@@ -29,6 +29,7 @@ def sound():
     return calibrate(simulate(N, 0))
 
 
+@pytest.mark.long
 def test_four_sensors_poses_are_within_their_claims(sound):
     assert len(sound) == 5
     for result in sound.values():
@@ -39,6 +40,7 @@ def test_four_sensors_poses_are_within_their_claims(sound):
         assert len(result.estimated_with) == 2
 
 
+@pytest.mark.long
 def test_four_sensors_loops_close(sound):
     T = {pair: c.T_cam_lidar for pair, c in sound.items()}
     for camera in ("left", "right"):

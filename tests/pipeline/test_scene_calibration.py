@@ -208,6 +208,7 @@ def test_views_of_other_scans_cannot_tell(panels, tmp_path):
     assert not calibrate_scene([path], "").result.pairs
 
 
+@pytest.mark.long
 def test_cannot_tell_exits_with_6(panels, tmp_path, capsys):
     path = session_of(tmp_path / "own", [(even(image), scan) for image, scan in panels])
     assert run(["calibrate", "--scene", str(path)]) == 6

@@ -59,6 +59,7 @@ def test_estimate_one_view_claims_cover_errors():
     assert len(chi2) > 10 and np.mean(chi2 < 12.59) >= 0.9
 
 
+@pytest.mark.long
 def test_estimate_blind_view_has_no_veto(views):
     blind = replace(views[0], outlines=views[0].outlines.select(np.zeros(len(views[0].outlines), dtype=bool)))
     expected, found = estimate(views[1:]), estimate([blind, *views[1:]])

@@ -63,6 +63,7 @@ def test_background_person_is_compensated():
     assert corrected < 0.6 * as_measured
 
 
+@pytest.mark.long
 def test_background_wall_is_compensated():
     rng = np.random.default_rng(0)
     captures = [lit(c, rng) for c in simulate(20, 5)]
