@@ -59,7 +59,7 @@ def test_event_images_match_whole_stream(given, passed):
         assert isinstance(other, Image) and np.array_equal(image.pixels, other.pixels)
 
 
-@pytest.mark.parametrize("late_ms", [120, 700])
+@pytest.mark.parametrize("late_ms", [120, pytest.param(700, marks=pytest.mark.long)])
 def test_event_images_late_scans_are_equal(rig, passed, late_ms):
     whole = replace(
         EVENTS[0],

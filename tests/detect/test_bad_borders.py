@@ -37,7 +37,9 @@ def boards(border: str, has_rings: bool, n: int = 5) -> list[tuple[LidarBoard, A
     return found
 
 
-@pytest.mark.parametrize("has_rings", [True, False], ids=["rings", "no rings"])
+@pytest.mark.parametrize(
+    "has_rings", [pytest.param(True, id="rings"), pytest.param(False, id="no rings", marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("border", [name for name in SCENES if name != "smeared by 20 mm"])
 def test_border_seen_in_part_has_ends_where_it_is(border: str, has_rings: bool) -> None:
     for board, T in boards(border, has_rings):

@@ -83,7 +83,11 @@ def test_explain_sound_captures_finds_nothing(seeds):
         (squares(0.97), "squares"),
         (longer(offset_m=0.06), "range_offset"),
         (lambda o: moved(o, lambda k: k >= 8, [0.01, 0, 0.01, np.radians(0.8), 0, 0]), "moved"),
-        (lambda o: moved(o, lambda k: k >= 14, [0, 0, 0, np.radians(3), 0, 0]), "moved"),
+        pytest.param(
+            lambda o: moved(o, lambda k: k >= 14, [0, 0, 0, np.radians(3), 0, 0]),
+            "moved",
+            marks=pytest.mark.long,
+        ),
         (lambda o: moved(o, lambda k: k % 3 == 0, [0, 0, 0, 0, np.radians(0.8), 0.01]), "groups"),
         (lambda o: moved(o, lambda k: k == 7, [0, 0, 0, 0, np.radians(0.8), 0.02]), "alone"),
     ],

@@ -84,6 +84,7 @@ def test_other_camera_is_given_on_both_sides(together):
     assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
 
 
+@pytest.mark.long
 def test_other_methods_only_compare_cameras(session, by_paper):
     for name in (LEFT, RIGHT):
         alone = detections({name: session[name]})
