@@ -116,6 +116,7 @@ def test_calibrate_of_mirrored_images_names_it_alone(captures):
     ]
 
 
+@pytest.mark.long
 def test_calibrate_of_some_mirrored_names_it_first(captures):
     some = [mirrored(item) if k % 2 else item for k, item in enumerate(captures)]
     (calibration,), _ = calibrate_detections(load_rig("rlfs"), detections_of(some), CalibrateOptions())

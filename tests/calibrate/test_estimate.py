@@ -92,6 +92,7 @@ def spoil(captures, numbers):
     return spoilt
 
 
+@pytest.mark.long
 def test_estimate_moved_of_100_are_refused():
     numbers = (2, 3, 50, 62, 90)
     estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, FAST)

@@ -76,6 +76,7 @@ def scores_of(results, moving):
     ]
 
 
+@pytest.mark.long
 def test_motion_time_offsets_are_found_to_ms(followed):
     results = [result for _, result in followed]
     # Eight scores: the 99.9 % point of chi-squared over its freedoms is 3.3.
@@ -93,6 +94,7 @@ def test_time_offsets_are_found_from_two_images_per_capture():
     assert np.mean(np.square(scores_of(results, moving))) < 4.6
 
 
+@pytest.mark.long
 def test_motion_compensation_halves_error(followed):
     compensated = [errors(result.T_cam_lidar) for _, result in followed]
     plain = [
@@ -103,6 +105,7 @@ def test_motion_compensation_halves_error(followed):
     assert np.all(rms < [0.07, 2.5])
 
 
+@pytest.mark.long
 def test_extrinsics_covariance_covers_moving_boards(followed):
     nees = []
     for _, result in followed:
@@ -112,6 +115,7 @@ def test_extrinsics_covariance_covers_moving_boards(followed):
     assert 1.9 < np.mean(nees) < 13.0
 
 
+@pytest.mark.long
 def test_corner_noise_is_estimated_by_channel(followed):
     noise_px = {channel.channel: channel.noise_px for channel in followed[0][1].channels}
     assert noise_px["frames"] == pytest.approx(0.1, rel=0.05)
@@ -126,6 +130,7 @@ def test_tracked_channel_alone_is_compensated():
     assert np.all(errors(result.T_cam_lidar) < [0.1, 4.0])
 
 
+@pytest.mark.long
 def test_motion_profile_offset_is_subtracted():
     captures = simulate_moving(25, 2, TRACKED)
     clocks = Clocks(channel_offset_s=dict(TRACKED.offset_s))
@@ -162,6 +167,7 @@ def test_motion_single_channel_is_unchanged():
     assert result.channel_difference is None
 
 
+@pytest.mark.long
 def test_motion_upside_down_image_is_rotated(followed):
     captures, right = followed[0]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -185,6 +191,7 @@ def test_motion_same_scan_is_one_placement():
     assert result.same_scan["000003"] == ("000003", "100003")
 
 
+@pytest.mark.long
 def test_motion_channel_difference_is_found(followed):
     apart = (0.03, 0.0, 0.0, 0.0, np.radians(1.0), 0.0)
     moved = estimate_extrinsics(

@@ -51,6 +51,7 @@ def detect(folder, rig):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("recording", "profile", "n_captures", "max_deg", "max_m"),
     [
@@ -71,6 +72,7 @@ def test_recording_extrinsics_are_near_reference(recordings, recording, profile,
     assert estimate.certificate.is_optimal
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", get_args(Method))
 def test_recording_sss_matches_driver_labels(recordings, method):
     """The simulator labels its clouds half an azimuth step of 360 / 1874 deg beside its rays."""
@@ -85,6 +87,7 @@ def test_recording_sss_matches_driver_labels(recordings, method):
     assert error @ np.linalg.solve(cov, error) < 16.8  # 99 % of the chi-squared distribution
 
 
+@pytest.mark.long
 def test_random_halves_of_a_recording_agree(recordings):
     rig = load_rig("rlfs")
     captures, board = detect(recordings / "rlfs01", rig), rig.board.to_board()

@@ -93,6 +93,7 @@ def test_session_lens_ignores_lidar(captures):
     assert np.abs(shift[3:]).max() < np.radians(0.01)
 
 
+@pytest.mark.long
 def test_lens_change_moves_extrinsics(captures):
     estimate = fit_extrinsic(captures, BOARD, of_profile(ROUGH))
     lens = estimate.lens

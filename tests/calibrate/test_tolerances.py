@@ -1,6 +1,7 @@
 """Errors of the profile's lens and board: what they do to a solution and to its covariance."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -64,6 +65,12 @@ def moves_of(estimate, source):
     return found.sigma * found.moves / SIGMAS[source]
 
 
+@cache
+def estimate_with_exact_lens():
+    exact = replace(KNOWN, lens=LensPrior(CAMERA, 0.0, 0.0, 0.0, is_board_exact=True))
+    return fit_extrinsic(simulate(20, 1, REAL), BOARD, replace(SETTINGS, tolerances=exact))
+
+
 @pytest.mark.parametrize(
     ("source", "board", "errors"),
     [
@@ -73,11 +80,9 @@ def moves_of(estimate, source):
     ],
 )
 def test_wrong_board_matches_sensitivities(source, board, errors):
-    exact = replace(KNOWN, lens=LensPrior(CAMERA, 0.0, 0.0, 0.0, is_board_exact=True))
-    captures, settings = simulate(20, 1, REAL), replace(SETTINGS, tolerances=exact)
-    sound = fit_extrinsic(captures, BOARD, settings)
-    plain = replace(settings, tolerances=None)
-    wrong = fit_extrinsic(as_profiled(captures, board=board), board, plain)
+    sound = estimate_with_exact_lens()
+    plain = replace(SETTINGS, tolerances=None)
+    wrong = fit_extrinsic(as_profiled(simulate(20, 1, REAL), board=board), board, plain)
     expected = np.array(errors) @ moves_of(sound, source)
     # Board at 2 m: metres and radians are comparable. Noise levels and associations change a little too.
     motion = difference(wrong.T_cam_lidar, sound.T_cam_lidar)

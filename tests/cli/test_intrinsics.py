@@ -81,6 +81,7 @@ def test_too_few_captures_exit_with_6(lce_rig, session):
     assert "3 of 3 captures" in outcome.err
 
 
+@pytest.mark.long
 def test_lidar_intrinsics_saved_or_refused(lce_rig, simulated, few, tmp_path):
     refused = lce_rig("lidar-intrinsics", few)
     assert refused.code == 6

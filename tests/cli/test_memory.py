@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import sys
 from lce_rig.cli import entry
@@ -13,6 +15,7 @@ sys.exit(run(sys.argv[1:]))
 """
 
 
+@pytest.mark.long
 def test_huge_file_is_refused_without_memory(tmp_path):
     with (tmp_path / "huge.raw").open("wb") as file:
         file.truncate(1 << 40)

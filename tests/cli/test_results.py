@@ -25,6 +25,7 @@ def two_results(calibrated_once, tmp_path):
     return shutil.copytree(make_once("two_results", make), tmp_path / "session")
 
 
+@pytest.mark.long
 def test_named_result_keeps_current_result(lce_rig, calibrated):
     assert lce_rig("repeat", calibrated).code == 2
     assert lce_rig("repeat", calibrated, "--name", "paper", "--name", "current").code == 4

@@ -39,6 +39,7 @@ def test_calibrate_simulated_matches_truth(lce_rig, session):
     assert {"result.json", "report.html", "extrinsics.yaml", "rles.urdf", "static_transforms.txt"} <= names
 
 
+@pytest.mark.long
 def test_calibrate_output_fits_twelve_lines(lce_rig, calibrated):
     first = (calibrated / "calibration" / "result.json").read_bytes()
     brief = lce_rig("calibrate", calibrated)
@@ -50,6 +51,7 @@ def test_calibrate_output_fits_twelve_lines(lce_rig, calibrated):
     assert len(lce_rig("calibrate", calibrated, "--explain").out.splitlines()) > 12
 
 
+@pytest.mark.long
 def test_without_rejects_captures_before_it_calibrates(lce_rig, calibrated):
     assert lce_rig("calibrate", calibrated, "--without", "4,99").code == 2
     assert not (calibrated / "rejected").exists()
@@ -134,6 +136,7 @@ def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated_few
     assert not any(figures["was_used"] for figures in pair["captures"].values())
 
 
+@pytest.mark.long
 def test_calibrate_failed_keeps_old_result(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
     folder = calibrated_few / "calibration"
@@ -212,6 +215,7 @@ def test_implausible_session_paths_exit_with_4(lce_rig, session):
     assert lce_rig("check", session).code == 4  # of an exchanged profile
 
 
+@pytest.mark.long
 def test_verify_of_two_lidars_draws_other_results(lce_rig, tmp_path):
     session, other = tmp_path / "session", tmp_path / "other.json"
     profile = Path(__file__).parents[1] / "rigs" / "two_lidars.yaml"

@@ -93,6 +93,7 @@ def test_collect_davis_file_equals_bag(tmp_path, collected, lidar):
     assert (again.captured, again.n_known) == ([], 1)
 
 
+@pytest.mark.long
 def test_collect_events_only_keeps_no_image(tmp_path, lidar):
     write_aedat4(tmp_path / "events.aedat4", _with_hot_pixels(moves.events()))
     session, report = run(tmp_path / "s", lidar, tmp_path / "events.aedat4")
@@ -140,6 +141,7 @@ def test_collect_torn_file_keeps_captures(tmp_path, lidar):
     assert any("torn ends" in note for note in report.notes)
 
 
+@pytest.mark.long
 def test_non_overlapping_clocks_are_an_error(tmp_path, lidar):
     late = [replace(e, t_ns=e.t_ns + 1_234_500_000_000) for e in moves.events()]
     write_aedat4(tmp_path / "late.aedat4", late)

@@ -38,9 +38,18 @@ def pictures(samples, rig, tally=None):
     return [sample for sample in found if isinstance(sample, Image)]
 
 
-def test_event_images_match_whole_stream(rig):
-    given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
-    passed = list(with_event_pictures(given, rig, ["davis"], Losses()))
+@pytest.fixture(scope="module")
+def given(rig):
+    """Events and scans in the order of their timestamps."""
+    return list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
+
+
+@pytest.fixture(scope="module")
+def passed(rig, given):
+    return list(with_event_pictures(given, rig, ["davis"], Losses()))
+
+
+def test_event_images_match_whole_stream(given, passed):
     assert [s for s in passed if not isinstance(s, Image)] == given
     found = [s for s in passed if isinstance(s, Image)]
     stamps_ns = [T0_NS + t * MS for t in MIDDLES_MS]
@@ -50,8 +59,8 @@ def test_event_images_match_whole_stream(rig):
         assert isinstance(other, Image) and np.array_equal(image.pixels, other.pixels)
 
 
-@pytest.mark.parametrize("late_ms", [120, 700])
-def test_event_images_late_scans_are_equal(rig, late_ms):
+@pytest.mark.parametrize("late_ms", [120, pytest.param(700, marks=pytest.mark.long)])
+def test_event_images_late_scans_are_equal(rig, passed, late_ms):
     whole = replace(
         EVENTS[0],
         **{n: np.concatenate([getattr(e, n) for e in EVENTS]) for n in ("t_ns", "x", "y", "polarity")},
@@ -60,7 +69,7 @@ def test_event_images_late_scans_are_equal(rig, late_ms):
     arrivals = [(int(e.t_ns[0]), k, e) for k, e in enumerate(cut)]
     arrivals += [(T0_NS + (t - 50 + late_ms) * MS, 10_000 + t, scan(t)) for t in MIDDLES_MS]
     late = pictures((sample for *_, sample in sorted(arrivals, key=lambda arrival: arrival[:2])), rig)
-    prompt = pictures(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig), rig)
+    prompt = [sample for sample in passed if isinstance(sample, Image)]
     assert [i.stamp_ns for i in late] == [i.stamp_ns for i in prompt]
     assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(late, prompt, strict=True))
 

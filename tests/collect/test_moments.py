@@ -46,6 +46,7 @@ def test_collect_each_stand_is_captured_once(collected):
         np.testing.assert_allclose(scan.points, shown.scans[0].points, atol=1e-6)
 
 
+@pytest.mark.long
 def test_collect_rejected_is_not_taken_again(collected, bag, rig, tmp_path):
     shutil.copytree(collected[0], tmp_path / "s")
     with Session.resume(tmp_path / "s", rig) as session:

@@ -161,6 +161,7 @@ def test_collect_killed_runs_lose_no_capture(tmp_path, folder):
     assert contents[0] == contents[1] and n_before == sorted(n_before)
 
 
+@pytest.mark.long
 @pytest.mark.dataset
 def test_foreign_recording_becomes_a_session(tmp_path, recordings):
     rig = load_rig("rlfs")

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from lce_rig.collect.board_search import sight_ahead
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment
@@ -139,6 +140,7 @@ def test_confirm_other_plate_is_refused():
     assert float(refused.figures["distance_m"]) > 1
 
 
+@pytest.mark.long
 def test_images_searched_ahead_give_the_same_detections():
     order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
     frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]

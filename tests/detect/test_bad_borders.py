@@ -37,7 +37,9 @@ def boards(border: str, has_rings: bool, n: int = 5) -> list[tuple[LidarBoard, A
     return found
 
 
-@pytest.mark.parametrize("has_rings", [True, False], ids=["rings", "no rings"])
+@pytest.mark.parametrize(
+    "has_rings", [pytest.param(True, id="rings"), pytest.param(False, id="no rings", marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("border", [name for name in SCENES if name != "smeared by 20 mm"])
 def test_partly_visible_border_has_ring_ends(border: str, has_rings: bool) -> None:
     for board, T in boards(border, has_rings):

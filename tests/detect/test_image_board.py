@@ -232,6 +232,7 @@ def _find(path, board, camera):
     return find_image_board(picture(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)), board, camera)
 
 
+@pytest.mark.long
 @pytest.mark.dataset
 @pytest.mark.parametrize(
     ("name", "at_least", "median_px"),
@@ -253,6 +254,7 @@ def test_boards_of_recordings_are_found(recordings, name, at_least, median_px):
     assert np.median([result.reprojection_px for result in boards]) < median_px
 
 
+@pytest.mark.long
 @pytest.mark.dataset
 def test_frames_and_event_images_agree(recordings):
     board, camera, paths = _recording(recordings / "rles02_lf")

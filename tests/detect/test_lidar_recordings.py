@@ -73,6 +73,7 @@ def test_recording_board_is_found_in_every_scan(recordings, name):
     assert np.median(ratios) == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["rlfs01", "sss_noise15mm", "rles01_lf", "rles02_lf"])
 def test_first_candidate_matches_image(recordings, name):
     folder = recordings / name

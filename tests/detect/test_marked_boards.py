@@ -157,6 +157,7 @@ def test_aprilgrid_wrong_lens_is_not_spacing(part):
         assert isinstance(result, ImageBoard) or result.code == "image.misfit"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["APRILTAG_25h9", "APRILTAG_36h10"])
 def test_another_family_of_apriltags_is_named(family):
     result = find_image_board(

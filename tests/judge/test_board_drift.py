@@ -46,8 +46,9 @@ def test_board_drift_hidden_rotation_is_seen() -> None:
         assert "scene.board_changed_jointly" in [finding.code for finding in board.findings]
 
 
-def test_board_drift_unchanged_extrinsics_pass() -> None:
-    for seed in range(6):
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 6), marks=pytest.mark.long)])
+def test_board_drift_unchanged_extrinsics_pass(seeds: range) -> None:
+    for seed in seeds:
         board = watched(deployed(np.zeros(6)), seed)
         assert (board.joint.is_changed, board.joint.axes) == (False, ())
         # Directions that boards do not determine are a note.

@@ -38,6 +38,7 @@ def sound():
     return [simulate_two(12, seed) for seed in range(N_SOUND)]
 
 
+@pytest.mark.long
 def test_images_pose_error_fits_covariance(sound):
     found = [pose_from_images(observed(session)) for session in sound]
     errors = np.array([difference(each.T_second_first, T_RIGHT_LEFT) for each in found])
@@ -85,8 +86,8 @@ def test_stale_extrinsics_contradict_images(seed):
     assert 0.025 < apart.figure("rms_m") < 0.055
 
 
-def test_scaled_lens_scatters_the_boards(sound):
-    session = observed(sound[0])
+def test_scaled_lens_scatters_the_boards():
+    session = observed(simulate_two(12, 0))
     longer = []
     for left, right in session:
         T = right.image.T_cam_board.copy()
@@ -97,8 +98,8 @@ def test_scaled_lens_scatters_the_boards(sound):
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
 
 
-def test_camera_pair_outlier_board_hardly_matters(sound):
-    session = observed(sound[1])
+def test_camera_pair_outlier_board_hardly_matters():
+    session = observed(simulate_two(12, 1))
     left, right = session[3]
     wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
     session[3] = left, replace(right, pose=replace(right.image, T_cam_board=wrong))
@@ -107,8 +108,8 @@ def test_camera_pair_outlier_board_hardly_matters(sound):
     assert np.linalg.norm(error[:3]) < 0.003
 
 
-def test_camera_pair_of_few_boards_is_not_judged(sound):
-    session = sound[2]
+def test_camera_pair_of_few_boards_is_not_judged():
+    session = simulate_two(12, 2)
     assert pose_from_images(observed(session)[:3]) is None
     left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)
     right = fit_extrinsic(session[RIGHT][6:], BOARD, OPTIONS)
@@ -119,8 +120,8 @@ def test_camera_pair_of_few_boards_is_not_judged(sound):
     assert findings(three) == []
 
 
-def test_shared_boards_are_paired_by_scan(sound):
-    pairs = observed(sound[3])
+def test_shared_boards_are_paired_by_scan():
+    pairs = observed(simulate_two(12, 3))
     left = {o.capture: o for o, _ in pairs}
     renamed = {f"{k:06d}": replace(o, capture=f"{k:06d}") for k, (_, o) in enumerate(pairs, 100)}
     shared = shared_boards(left, renamed)

@@ -55,6 +55,7 @@ def through(rig: Rig, camera: str, source: str, board: Observation) -> Observati
     return replace(board, pose=board_from_pose(corners, solved))
 
 
+@pytest.mark.long
 def test_exchanged_like_cameras_are_found() -> None:
     session = simulate_two(12, 1)
     assert exchanged(calibrated(RIG, session, (LEFT, RIGHT))) == []

@@ -60,8 +60,9 @@ def calibrated(boards: list[Observation]) -> Calibration:
     return calibration
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angle_deg", [1.5, 3.0, 5.0])
-@pytest.mark.parametrize("n_moved", [2, pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.parametrize("n_moved", [2, 3])
 def test_a_sensor_that_moved_before_the_last_captures_fails(n_moved: int, angle_deg: float) -> None:
     calibration = calibrated(moved(simulate(15, 2), range(15 - n_moved, 15), turned(angle_deg)))
     first = calibration.findings[0]
@@ -73,6 +74,7 @@ def test_a_sensor_that_moved_before_the_last_captures_fails(n_moved: int, angle_
     assert first.figures["neighbour"] == f"{14 - n_moved:06d}"
 
 
+@pytest.mark.long
 def test_early_moved_sensor_does_not_pass() -> None:
     calibration = calibrated(moved(simulate(15, 3), range(2), turned(3.0, 0)))
     first = calibration.findings[0]
@@ -80,6 +82,7 @@ def test_early_moved_sensor_does_not_pass() -> None:
     assert (first.figures["place"], first.figures["neighbour"]) == ("first", "000002")
 
 
+@pytest.mark.long
 def test_captures_in_any_order_that_agree_are_one_mounting() -> None:
     boards = simulate(18, 4)
     away = (3, 8, 12)

@@ -364,6 +364,7 @@ def test_wrong_square_size_is_measured():
     assert scale.figure("square_m") == pytest.approx(0.0735, abs=5e-4)
 
 
+@pytest.mark.long
 def test_wrong_squares_come_before_the_lens():
     other = replace(CAMERA, fx_px=1.04 * CAMERA.fx_px, fy_px=1.04 * CAMERA.fy_px)
     profile = RIG.board.model_copy(update={"square_m": 0.93 * BOARD.square_m})

@@ -27,6 +27,7 @@ def found():
     return Detections({("cam", "frames"): images}, {"lidar": {c.capture: list(c.places) for c in captures}})
 
 
+@pytest.mark.long
 def test_the_lidars_range_errors_come_from_the_profile():
     exact = systematic_sigma_m("laser_bias_sigma_m: 0", "range_offset_sigma_m: 0")
     assert exact == 0

@@ -55,6 +55,7 @@ def test_camera_that_moved_fails_and_is_dated():
     assert first.code == "verdict.moved" and 8 <= first.figures["n_captures"] <= 12
 
 
+@pytest.mark.long
 def test_camera_without_lidar_hangs_on_the_rig():
     sensors = ("left", "right", "front")
     found = simulate(40, 0, sensors=sensors, n_seeing=(2,))
@@ -74,6 +75,7 @@ def test_camera_without_lidar_hangs_on_the_rig():
     assert np.degrees(np.linalg.norm(off[3:])) < 0.3 and np.linalg.norm(off[:3]) < 0.03
 
 
+@pytest.mark.long
 def test_rig_in_two_parts_asks_for_placement():
     found = simulate(40, 0)
     front = {n: b for n, b in found.lidars["front"].items() if n in found.images["left", "frames"]}

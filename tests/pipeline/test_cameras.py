@@ -84,6 +84,7 @@ def test_other_camera_is_given_on_both_sides(together):
     assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
 
 
+@pytest.mark.long
 def test_other_methods_only_compare_cameras(session, by_paper):
     for name in (LEFT, RIGHT):
         alone = detections({name: session[name]})
@@ -109,6 +110,7 @@ def test_cameras_without_a_common_board_share_the_lidar(session):
         assert own.other_cameras == ()
 
 
+@pytest.mark.long
 def test_failed_cameras_each_have_a_reason(session):
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
@@ -117,7 +119,9 @@ def test_failed_cameras_each_have_a_reason(session):
     assert "4 of 12" in other
 
 
-@pytest.mark.parametrize("options", [ML, PAPER], ids=["ml", "paper"])
+@pytest.mark.parametrize(
+    "options", [pytest.param(ML, id="ml"), pytest.param(PAPER, id="paper", marks=pytest.mark.long)]
+)
 def test_nudged_camera_is_named_and_the_other_kept(options):
     found = calibrated(detections(simulate_two(12, 1, nudge=TURNED, nudged_from=6)), options)
     assert [own.estimated_with for own in found.values()] == [(), ()]

@@ -29,6 +29,7 @@ def sound():
     return calibrate(simulate(N, 0))
 
 
+@pytest.mark.long
 def test_four_sensors_errors_fit_covariance(sound):
     assert len(sound) == 5
     for result in sound.values():
@@ -39,6 +40,7 @@ def test_four_sensors_errors_fit_covariance(sound):
         assert len(result.estimated_with) == 2
 
 
+@pytest.mark.long
 def test_four_sensors_loops_close(sound):
     T = {pair: c.T_cam_lidar for pair, c in sound.items()}
     for camera in ("left", "right"):
@@ -46,7 +48,8 @@ def test_four_sensors_loops_close(sound):
         assert np.allclose(closed, T[camera, "rear"], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["right", pytest.param("rear", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["right", "rear"])
 def test_sensor_that_moved_is_named_and_others_pass(name):
     after = perturb(ON_FRONT[name], np.r_[0.01, 0.0, 0.01, np.radians([0.6, 0.0, 0.8])])
     moves = {name: lambda k: ON_FRONT[name] if k < N // 2 else after}
@@ -59,6 +62,7 @@ def test_sensor_that_moved_is_named_and_others_pass(name):
             assert results[pair].verdict == "pass"
 
 
+@pytest.mark.long
 def test_exchanged_lidars_are_named_in_all_pairs():
     found = simulate(N, 1)
     front, rear = found.lidars["front"], found.lidars["rear"]
@@ -67,6 +71,7 @@ def test_exchanged_lidars_are_named_in_all_pairs():
         assert len(texts) == 1 and "front and rear are exchanged" in texts[0]
 
 
+@pytest.mark.long
 def test_moved_sensor_is_named_from_few_captures():
     """The cameras have one and two captures before the motion, and one result does not use its own."""
     after = perturb(ON_FRONT["rear"], np.r_[0.012, -0.004, 0.016, np.radians([0.5, 0.6, -0.6])])
@@ -79,6 +84,7 @@ def test_moved_sensor_is_named_from_few_captures():
     assert verdicts == {"rear": ["pass", "fail", "fail"], "others": ["pass", "pass"]}
 
 
+@pytest.mark.long
 def test_sensor_on_another_clock_is_named_once():
     """Scans of `rear` are those of the next capture."""
     found = simulate(N, 3)

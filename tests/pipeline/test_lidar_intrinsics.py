@@ -74,6 +74,7 @@ def test_measure_lidar_like_lasers_saves_only_offset(tmp_path):
     assert saved.range_offset_m == pytest.approx(errors.offset_m, abs=1e-5) and saved.intrinsics is None
 
 
+@pytest.mark.long
 def test_measure_lidar_moved_and_long_is_refused(tmp_path):
     session = lce.Session.create(tmp_path / "session", lce.load_rig("rlfs"))
     with pytest.raises(ResultRefusedError):

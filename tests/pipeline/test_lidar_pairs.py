@@ -102,6 +102,7 @@ def test_lidar_pairs_symmetric_plate_is_fine(sides):
     assert off @ np.linalg.solve(result.cov, off) < 25
 
 
+@pytest.mark.long
 def test_without_a_nominal_pose_alike_lidars_never_pass():
     rig = make_rig(nominal=False)
     result = calibrate(rig, scan_both(14, 1, rig.board.to_board()))
@@ -111,10 +112,8 @@ def test_without_a_nominal_pose_alike_lidars_never_pass():
     assert not codes(calibrate(rig, scan_both(14, 1, rig.board.to_board())))
 
 
-@pytest.mark.parametrize(
-    ("n_moved", "turn_deg"),
-    [pytest.param(7, 1.0, marks=pytest.mark.long), pytest.param(4, 2.0, marks=pytest.mark.long), (2, 3.0)],
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("n_moved", "turn_deg"), [(7, 1.0), (4, 2.0), (2, 3.0)])
 def test_a_lidar_that_moved_between_captures_never_passes(n_moved, turn_deg):
     rig = make_rig()
     move = np.r_[0.01, 0, 0.02, np.radians([0.0, 0.6 * turn_deg, 0.8 * turn_deg])]
@@ -140,6 +139,7 @@ def test_lidar_pairs_cut_boards_are_refused():
     assert caught.value.finding.code == "shortage.few_detected"
 
 
+@pytest.mark.long
 def test_lidar_pairs_other_plate_is_refused():
     """The result is that of the other captures."""
     rig = make_rig()

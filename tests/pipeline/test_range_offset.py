@@ -35,7 +35,7 @@ def fill(folder, captures):
 
 @pytest.fixture(scope="module")
 def captures():
-    return simulated(2)
+    return simulated(1)
 
 
 @pytest.fixture

@@ -111,12 +111,14 @@ def test_verify_without_board_advises_drift(drive, tmp_path, capsys):
     assert "lce-rig drift" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_folder_again_keeps_captures(drive, tmp_path):
     words = ["calibrate", "--scene", str(drive), "--rig", profile(tmp_path), str(tmp_path / "out")]
     assert run(words) == 0 and run(words) == 0
     assert len(Session.open(tmp_path / "out").captures) == 3
 
 
+@pytest.mark.long
 def test_session_keeps_its_own_result(panels, tmp_path, capsys, monkeypatch):
     path = session_of(tmp_path / "session", panels)
     monkeypatch.chdir(tmp_path)
@@ -125,6 +127,7 @@ def test_session_keeps_its_own_result(panels, tmp_path, capsys, monkeypatch):
     assert (path / "results" / "scene" / "result.json").exists() and not (path / "calibration").exists()
 
 
+@pytest.mark.long
 def test_bag_is_read_as_a_folder_is(panels, tmp_path):
     with BagRecorder(tmp_path / "drive.bag", RIG) as bag:
         for second, (image, scan) in enumerate(panels):
@@ -141,27 +144,32 @@ def verdict_of(panels, tmp_path, rig):
     return c.verdict, {finding.code for finding in c.findings if finding.severity != "note"}
 
 
+@pytest.mark.long
 def test_views_of_one_place_do_not_pass(panels, tmp_path):
     rig = rig_of(nominal(perturb(TRUTH, OFF)), target_sigma_m=0.2, target_sigma_deg=2.0)
     verdict, codes = verdict_of([panels[0]] * 3, tmp_path, rig)
     assert verdict == "marginal" and codes == {"scene_calibration.one_place"}
 
 
+@pytest.mark.long
 def test_wide_targets_pass_with_cad(panels, tmp_path):
     rig = rig_of(nominal(perturb(TRUTH, OFF)), target_sigma_m=0.2, target_sigma_deg=2.0)
     assert verdict_of(panels, tmp_path, rig) == ("pass", set())
 
 
+@pytest.mark.long
 def test_typical_nominal_is_marginal(panels, tmp_path):
     rig = rig_of(nominal(perturb(TRUTH, OFF), "typical"), target_sigma_m=0.2, target_sigma_deg=2.0)
     assert verdict_of(panels, tmp_path, rig) == ("marginal", {"scene_calibration.typical"})
 
 
+@pytest.mark.long
 def test_sigma_beyond_target_is_marginal(panels, tmp_path):
     rig = rig_of(nominal(perturb(TRUTH, OFF)), target_sigma_m=0.001)
     assert verdict_of(panels, tmp_path, rig) == ("marginal", {"scene_calibration.uncertain"})
 
 
+@pytest.mark.long
 def test_far_from_cad_fails(panels, tmp_path):
     entry = nominal(perturb(TRUTH, OFF)) | {"tolerance_m": 0.01}
     rig = rig_of(entry, target_sigma_m=0.2, target_sigma_deg=2.0)
@@ -181,6 +189,7 @@ def even(image):
     return replace(image, pixels=np.full_like(image.pixels, 128))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("change", "code"), [(dark, "dark"), (mirrored, ""), (even, "weak")])
 def test_bad_images_cannot_tell(panels, tmp_path, change, code):
     path = session_of(tmp_path / "own", [(change(image), scan) for image, scan in panels])
@@ -192,12 +201,14 @@ def test_bad_images_cannot_tell(panels, tmp_path, change, code):
         found.require_pairs()
 
 
+@pytest.mark.long
 def test_views_of_other_scans_cannot_tell(panels, tmp_path):
     images, scans = zip(*panels, strict=True)
     path = session_of(tmp_path / "own", zip(images, scans[1:] + scans[:1], strict=True))
     assert not calibrate_scene([path], "").result.pairs
 
 
+@pytest.mark.long
 def test_cannot_tell_exits_with_6(panels, tmp_path, capsys):
     path = session_of(tmp_path / "own", [(even(image), scan) for image, scan in panels])
     assert run(["calibrate", "--scene", str(path)]) == 6
@@ -220,6 +231,7 @@ def test_recording_without_profile_is_refused(drive, tmp_path):
         calibrate_scene([drive], tmp_path / "out")
 
 
+@pytest.mark.long
 def test_calibrate_scene_keeps_lens_errors(panels, tmp_path):
     path = session_of(tmp_path / "session", panels)
     (found,) = calibrate_scene([path], path).result.pairs

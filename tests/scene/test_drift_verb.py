@@ -54,6 +54,7 @@ def test_drift_changed_exits_with_7_in_six_lines(room, turned, capsys):
     assert lines[1].startswith("  Scene: changed") and lines[-1].startswith("  -> Fasten")
 
 
+@pytest.mark.long
 def test_a_folder_is_compared_as_a_session_is(room, seen, turned, tmp_path):
     folder = tmp_path / "folder"
     session = Session.open(room)
@@ -110,6 +111,7 @@ def two_cameras(seen):
     return Rig.model_validate(document)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["room.bag", "room_mcap"])
 def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, capsys):
     bag = record(tmp_path / name, seen.rig, seen.captures)
@@ -123,6 +125,7 @@ def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, c
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, "result.json", "rig.yaml"])
 
 
+@pytest.mark.long
 def test_drift_exit_code_follows_worst_camera(seen, two_cameras, tmp_path, capsys):
     bag = record(tmp_path / "two.bag", two_cameras, seen.captures, ("cam", "cam2"))
     (tmp_path / "rig.yaml").write_text(dump_rig(two_cameras))
@@ -200,6 +203,7 @@ def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path):
     assert pair["state"] != "changed" and pair["scene"]["n_captures"] > 0
 
 
+@pytest.mark.long
 def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp_path):
     """As two recorders leave them: a pcap of the VLP-16, and frames of the camera's own file."""
     starts_ns = [T0_NS + k * PERIOD_NS for k in range(len(seen.captures))]
@@ -247,6 +251,7 @@ def test_drift_contradictory_arguments_are_refused(room, seen, tmp_path):
     assert run(["drift", str(tmp_path / "nothing"), "--rig", "rlfs"]) == 4
 
 
+@pytest.mark.long
 def test_drift_board_in_view_is_evaluated(room, turned):
     for result, state in ((None, "unchanged"), (read_result(turned), "changed")):
         (pair,) = drift(room, result).pairs

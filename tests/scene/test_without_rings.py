@@ -36,10 +36,12 @@ def judge(seen, tangent=(0.0,) * 6):
     return watch_scene(seen.views, seen.rig.lens_of(c), c)
 
 
+@pytest.mark.long
 def test_scene_without_rings_truth_holds(seen):
     assert judge(seen).state == "unchanged"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("axis", MOTIONS)
 def test_scene_without_rings_changes_do_not_hold(seen, axis, sign):
@@ -81,6 +83,7 @@ def drives(recordings):
     return Seen(rig, [], c, [build_view(rig, c, k.name, k.image, k.scan) for k in captures.kept[0]])
 
 
+@pytest.mark.long
 @pytest.mark.dataset
 @pytest.mark.parametrize("axis", [None, *range(6)])
 def test_drives_changed_by_1_deg_or_20_cm_never_hold(drives, axis):
@@ -95,6 +98,7 @@ def test_drives_changed_by_1_deg_or_20_cm_never_hold(drives, axis):
             assert drift.state != "unchanged"
 
 
+@pytest.mark.long
 @pytest.mark.dataset
 def test_drift_reads_a_folder_of_drives(drives, recordings, tmp_path, capsys):
     write_result(tmp_path / "result.json", drives.rig.name, [drives.truth])

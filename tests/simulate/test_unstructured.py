@@ -20,7 +20,8 @@ def of_model(model):
     return changed(load_rig("mid360"), lidars__lidar__model=model)
 
 
-@pytest.mark.parametrize("model", ["Mid-360", pytest.param("Avia", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("model", ["Mid-360", "Avia"])
 def test_beams_fill_the_view_and_find_board(model):
     rig = of_model(model)
     sheet = rig.lidars["lidar"].data_sheet()

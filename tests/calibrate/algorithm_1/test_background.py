@@ -63,6 +63,7 @@ def test_background_person_is_compensated():
     assert corrected < 0.6 * as_measured
 
 
+@pytest.mark.long
 def test_background_wall_is_compensated():
     rng = np.random.default_rng(0)
     captures = [lit(c, rng) for c in simulate(20, 5)]
@@ -80,6 +81,7 @@ def test_background_person_echo_is_estimated_separately():
     assert found.edge_shift_blended_echo_m == pytest.approx(-0.02, abs=0.008)
 
 
+@pytest.mark.long
 def test_background_without_effect_is_unused():
     """Backgrounds of any brightness and distance, wide steps, lost returns: and no effect on the edges."""
     scenario = Scenario(step_deg=0.4, footprint_m=0.008, lost_share=0.2)

@@ -53,6 +53,7 @@ def runs():
     return run([few_on_the_right(16, seed) for seed in range(3)])
 
 
+@pytest.mark.long
 def test_join_few_captures_gain_accuracy(runs):
     for own, together in runs:
         before, after = own[RIGHT], together.estimates[RIGHT, "lidar"]
@@ -66,6 +67,7 @@ def test_join_few_captures_gain_accuracy(runs):
         assert len(together.estimates[LEFT, "lidar"].used) == 16
 
 
+@pytest.mark.long
 def test_join_camera_pair_beats_lidar_pairs(runs):
     for _, together in runs:
         T, cov = together.between(RIGHT, LEFT)

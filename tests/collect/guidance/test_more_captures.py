@@ -28,6 +28,7 @@ def placements():
     return held
 
 
+@pytest.mark.long
 def test_plan_few_captures_reaches_minimum(placements):
     rig = load_rig("rlfs")
     for n in (0, 3, 5):

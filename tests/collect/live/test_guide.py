@@ -205,6 +205,7 @@ def follow_guide(rig, n_wanted, person=None, can_be_held=lambda _T_cam_board: Tr
     return walk
 
 
+@pytest.mark.long
 def test_walk_continued_gets_new_placements():
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
