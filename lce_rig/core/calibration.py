@@ -218,7 +218,8 @@ class Contribution:
 
     Attributes:
         source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
-            "intrinsics" or "square_size", or "contradiction_" with the check that contradicts.
+            "intrinsics" or "square_size", "algorithm_1" (its difference from the likelihood's estimate), or
+            "contradiction_" with the check that contradicts.
         sigma_rotation_deg, sigma_translation_m: its contribution.
     """
 

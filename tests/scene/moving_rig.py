@@ -20,23 +20,24 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class MovingRig:
-    """Drives with a velocity (3,) m/s, and turns at a rate (rad/s) about the vertical."""
+    """Drives with a velocity (3,) m/s, and turns at a rate (3,) rad/s."""
 
     stage: Stage
     velocity_mps: Array
-    turn_rad_s: float
+    rate_rad_s: Array
     T_world_start: Array
 
     @classmethod
-    def build(cls, rig, seed, velocity_mps, turn_rad_s, at=(0.0, 0.0)):
+    def build(cls, rig, seed, velocity_mps, rate_rad_s, at=(0.0, 0.0), heading_rad=0.0):
         stage = set_stage(rig, seed, SimulationOptions.for_rig(rig.name))
-        start = pose(np.eye(3), np.array([*at, 0.0]))
-        return cls(stage, np.array(velocity_mps, dtype=np.float64), turn_rad_s, start)
+        start = pose(exp_so3(np.array([0.0, 0.0, heading_rad])), np.array([*at, 0.0]))
+        rates = (np.array(each, dtype=np.float64) for each in (velocity_mps, rate_rad_s))
+        return cls(stage, *rates, start)
 
     def base_at(self, t_ns):
         """Pose of the rig relative to its pose in the stage, (..., 4, 4)."""
         t_s = 1e-9 * (np.asarray(t_ns, dtype=np.float64) - START_NS)[..., None]
-        turn = exp_so3(t_s * [0.0, 0.0, self.turn_rad_s])
+        turn = exp_so3(t_s * self.rate_rad_s)
         return self.T_world_start @ pose(turn, t_s * self.velocity_mps)
 
     def sensor_at(self, sensor, t_ns):
