@@ -45,8 +45,13 @@ def by_algorithm_1(
     """
     likely = by_likelihood(start, joint, board, lens)
     apart = difference(start.T_cam_lidar, likely.T_cam_lidar)
-    of_both = ("edge_shift_sigma_m", *SIGMAS_OF_PARTS)
-    figures = replace(start.diagnostics, **{name: getattr(likely.diagnostics, name) for name in of_both})
+    own, theirs = start.diagnostics, likely.diagnostics
+    shift_apart_m = own.edge_shift_m - theirs.edge_shift_m
+    figures = replace(
+        own,
+        **{name: getattr(theirs, name) for name in SIGMAS_OF_PARTS},
+        edge_shift_sigma_m=math.hypot(theirs.edge_shift_sigma_m, shift_apart_m),
+    )
     estimate = report(start, start.T_cam_lidar, likely.cov, board, figures)
     return replace(
         likely,

@@ -12,6 +12,7 @@ from lce_rig.core.geometry import exp_so3, fit_plane, invert, perturb, pose, pro
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import LidarBoard, LidarQuality, Observation
 from lce_rig.detect.image.search import board_from_pose
+from lce_rig.judge.contributions import summed_covariance
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import model_of
 
@@ -41,6 +42,11 @@ class Scenario:
     facing_deg: float | None = None
     template_sigma_rad: float = 0.03
     template_sigma_m: float = 0.01
+
+
+def claim(estimate):
+    """Covariance (6, 6) of an estimate with errors of the profile."""
+    return estimate.cov + summed_covariance(estimate.sensitivities)
 
 
 def simulate(n, seed, scenario=None, T_cam_lidar=T_FORWARD, board=BOARD):

@@ -9,7 +9,7 @@ from lce_rig.calibrate import EstimateSettings, capture_residual, error_to_refer
 from lce_rig.calibrate.result import summarise
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
-from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, claim, simulate
 
 FAST = EstimateSettings("paper")
 
@@ -21,7 +21,7 @@ def errors_over_seeds(scenario, n_captures, n_seeds, options=FAST):
         estimate = fit_extrinsic(simulate(n_captures, seed, scenario), BOARD, options)
         error = difference(estimate.T_cam_lidar, T_FORWARD)
         errors.append(error)
-        nees.append(error @ np.linalg.solve(estimate.cov, error))
+        nees.append(error @ np.linalg.solve(claim(estimate), error))
     return np.array(errors), np.array(nees)
 
 

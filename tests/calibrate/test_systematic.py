@@ -7,15 +7,10 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.geometry import difference, sigma_sizes
-from lce_rig.judge.contributions import summed_covariance
-from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, claim, simulate
 
 NO_DRAWS = EstimateSettings("paper")
 LASER_SIGMA_M, OFFSET_SIGMA_M = 0.008, 0.005
-
-
-def claim(estimate):
-    return estimate.cov + summed_covariance(estimate.sensitivities)
 
 
 def normalised_errors(options, n_seeds):
