@@ -17,7 +17,15 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "docs" / "figures.json"
-PAGES = tuple(ROOT / name for name in ("README.md", "docs/benchmarks.md", "docs/how-accuracy-was-tested.md"))
+PAGES = tuple(
+    ROOT / name
+    for name in (
+        "README.md",
+        "docs/benchmarks.md",
+        "docs/how-accuracy-was-tested.md",
+        "docs/without-a-board.md",
+    )
+)
 _LEFT = "-"
 _FIGURE = re.compile(r"(<!-- figure: (\S+) -->).*?(<!-- / -->)")
 _ROW = re.compile(r"<!-- row: (?:(\S+): )?(.*?) -->")

@@ -139,20 +139,22 @@ def _print_against_boards() -> None:
             recorded.collect(session)
             c, rig = _by_boards(session)
             found = calibrate_scene([session], "", rig=_with_nominal(rig, c)).result
-            if not found.pairs:
-                print_row(recorded.name, "", "", "", "", found.shortages[0].code)
-                continue
-            (scene,) = found.pairs
-            apart = difference(scene.T_cam_lidar, c.T_cam_lidar)
-            chi2 = float(apart @ np.linalg.solve(scene.cov + c.cov, apart))
-            sizes, sigmas = tangent_sizes(apart), sigma_sizes(scene.cov)
             key = f"scene.{recorded.name}"
-            measure(f"{key}.views", "{}", len(scene.captures_used))
-            measure(f"{key}.difference", _SIZE, sizes[0], 1000 * sizes[1])
-            measure(f"{key}.claim", _SIZE, sigmas[0], 1000 * sigmas[1])
-            measure(f"{key}.chi2", "{:.1f}", chi2)
-            reported = (_SIZE.format(a, 1000 * b) for a, b in (sizes, sigmas))
-            print_row(recorded.name, len(scene.captures_used), *reported, f"{chi2:.1f}", scene.verdict)
+            if not found.pairs:
+                cells: tuple[str, ...] = ("-", "*cannot tell*", "-", "-")
+                print_row(recorded.name, *cells, found.shortages[0].code)
+            else:
+                (scene,) = found.pairs
+                apart = difference(scene.T_cam_lidar, c.T_cam_lidar)
+                chi2 = float(apart @ np.linalg.solve(scene.cov + c.cov, apart))
+                sizes = (
+                    _SIZE.format(angle_deg, 1000 * distance_m)
+                    for angle_deg, distance_m in (tangent_sizes(apart), sigma_sizes(scene.cov))
+                )
+                cells = (str(len(scene.captures_used)), *sizes, f"{chi2:.1f}")
+                print_row(recorded.name, *cells, scene.verdict)
+            for name, cell in zip(("views", "difference", "claim", "chi2"), cells, strict=True):
+                measure(f"{key}.{name}", "{}", cell)
 
 
 def _by_boards(path: Path) -> tuple[Calibration, Rig]:

@@ -121,6 +121,7 @@ def _print_errors(
     n_covered = sum(each.chi2(T) < _CHI2_95 for each in usable)
     states = Counter(each.state for each in found if each.state != "usable")
     measure(f"scene_estimate.{name}.covered", "{} of {}", n_covered, len(usable))
+    measure(f"scene_estimate.{name}.within", "{} of {}", n_within, n_trials)
     if usable:
         measure(f"scene_estimate.{name}.error", _SIZE, *_deg_mm(np.median(errors, axis=0)))
     spread = np.array([_sizes(each) for each in usable]).reshape(-1, 2)
