@@ -28,9 +28,9 @@ class MovingRig:
     T_world_start: Array
 
     @classmethod
-    def build(cls, rig, seed, velocity_mps, rate_rad_s, at=(0.0, 0.0), heading_rad=0.0):
+    def build(cls, rig, seed, velocity_mps, rate_rad_s, at=(0.0, 0.0)):
         stage = set_stage(rig, seed, SimulationOptions.for_rig(rig.name))
-        start = pose(exp_so3(np.array([0.0, 0.0, heading_rad])), np.array([*at, 0.0]))
+        start = pose(np.eye(3), np.array([*at, 0.0]))
         rates = (np.array(each, dtype=np.float64) for each in (velocity_mps, rate_rad_s))
         return cls(stage, *rates, start)
 

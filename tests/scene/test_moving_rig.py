@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from lce_rig.core.calibration import MOTIONS, ResultFile
-from lce_rig.core.geometry import difference, perturb
+from lce_rig.core.geometry import difference, exp_so3, perturb, pose, transform
 from lce_rig.pipeline.scene_calibration import View, calibrate_pair
 from lce_rig.pipeline.watch_drift import SceneCaptures
-from lce_rig.rig import NominalExtrinsic
+from lce_rig.rig import NominalExtrinsic, load_rig
 from lce_rig.scene.rig_motion import estimate_motion
-from lce_rig.timing.scan_pairing import Frame
+from lce_rig.timing.scan_pairing import EventCut, Frame
 from tests.scene.conftest import deployed, small_rig
 from tests.scene.moving_rig import START_NS, MovingRig
+from tests.shared import compute_once
 
 pytestmark = pytest.mark.long
 PERIOD_NS = 100_000_000
@@ -136,3 +137,55 @@ def test_scene_calibration_moves_edges_to_images(driven):
 def test_scene_calibration_untimed_moving_is_no_result(driven):
     found = calibrated(driven, lambda scan: replace(scan, offset_ns=None))
     assert found.code == "scene_calibration.moving"
+
+
+def drive_by_events():
+    """Pan and tilt a DAVIS346 without frames through a room: profile, truth, and twelve views."""
+    rng, views = np.random.default_rng(1), []
+    standing = MovingRig.build(load_rig("rles"), 1, (0, 0, 0), (0, 0, 0))
+    profile, truth = standing.stage.rig, standing.truth("davis", "lidar")
+    lens = profile.cameras["davis"].to_intrinsics()
+    for k in range(12):
+        heading = exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        rig = replace(
+            standing,
+            velocity_mps=rng.uniform(-0.5, 0.5, 3),
+            rate_rad_s=rng.uniform(0.25, 0.6, 3) * rng.choice([-1, 1], 3),
+            T_world_start=pose(heading, np.append(rng.uniform(-0.8, 0.8, 2), 0.0)),
+        )
+        before, scan = (rig.scan("lidar", START_NS + step * PERIOD_NS, 10 * k - step) for step in (-1, 0))
+        pixels, is_valid = lens.project(transform(truth, scan.points))
+        seen_ns = START_NS + int(np.median(scan.offset_ns[is_valid & lens.is_inside(pixels)]))
+        events = rig.events("davis", seen_ns - 16_000_000, seen_ns + 16_000_000, k, n_steps=6)
+        cut = EventCut((events,), int(events.t_ns[0]), int(events.t_ns[-1]) + 1, 0, 0)
+        views.append(View(str(k), (), (scan,), (cut,), {"lidar": before}))
+    return profile, truth, views
+
+
+@pytest.fixture(scope="module")
+def event_drive():
+    return compute_once("event_drive", drive_by_events)
+
+
+def calibrated_by_events(profile, truth, views):
+    off = perturb(truth, np.array([0.05, -0.04, 0.06, 0.012, -0.01, 0.014]))
+    nominal = NominalExtrinsic(
+        camera="davis", lidar="lidar", matrix=off[:3, :3].tolist(), translation_m=off[:3, 3].tolist()
+    )
+    return calibrate_pair(profile, nominal, views)
+
+
+def test_scene_calibration_by_events_covers_truth(event_drive):
+    profile, truth, views = event_drive
+    c, drawn = calibrated_by_events(profile, truth, views)
+    tangent = difference(c.T_cam_lidar, truth)
+    assert c.channels == ("events",) and len(drawn) == len(views)
+    assert tangent @ np.linalg.solve(c.cov, tangent) < 16.81
+    assert np.degrees(np.linalg.norm(tangent[3:])) < 0.4 and np.linalg.norm(tangent[:3]) < 0.04
+
+
+def test_scene_calibration_by_events_needs_motion(event_drive):
+    profile, truth, views = event_drive
+    standing = [replace(view, previous={"lidar": view.scans[0]}) for view in views[:2]]
+    shortage, _ = calibrated_by_events(profile, truth, standing)
+    assert shortage.code == "scene_calibration.events_of_standing_rig" and "cannot tell" in shortage.text
