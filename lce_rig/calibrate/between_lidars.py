@@ -1,13 +1,13 @@
 """Two LiDARs that saw the same boards: agreeing captures, and the initial guess of the relative pose.
 
-    place_boards      the boards' poses by each LiDAR alone, of maximum likelihood, with its constant errors
+    place_boards      maximum-likelihood poses of the boards from each LiDAR alone, with its constant errors
     find_consensus    the captures that agree on one rigid transform
     solve             Algorithm 1: the outliers, and where the estimate (`rig_estimate`) starts
 
 The boards' poses by the first LiDAR are compared with the second one's points and ring ends.
 
-A plate without print looks the same turned by 180 deg, a square one by 90 deg. Normals and middles of several
-boards decide T_12 without that turn, which then follows by capture.
+A plate without a pattern looks the same rotated by 180 deg, a square one by 90 deg. Normals and middles of
+several boards decide T_12 without that turn, which then follows by capture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -62,9 +62,9 @@ class LidarPair(NamedTuple):
 
     Attributes:
         start: pose of the second by Algorithm 1, with the captures that agree.
-        boards: by capture in both scans.
+        boards: boards in both scans, by capture.
         alone: estimate of the boards by each LiDAR alone.
-        joint: of the same boards, from the first LiDAR's poses: only to judge whether mountings changed.
+        joint: the same from the first LiDAR's poses, only to judge whether mountings changed.
         rejected: the other captures in which both see a plate.
         T_view: (4, 4) T_optical_first.
     """
@@ -105,8 +105,8 @@ def match_lidars(
     The optical frame has the first LiDAR's origin, z level towards the boards and y down.
 
     Args:
-        candidates: of each capture with the board in both scans; the first LiDAR's poses in its own frame.
-        first: by capture the places in its scan where the board may be.
+        candidates: one per capture with the board in both scans; the first LiDAR's poses in its own frame.
+        first: places in its scan where the board may be, by capture.
         board: the plate.
         settings: the profile's settings of each LiDAR.
 

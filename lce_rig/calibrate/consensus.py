@@ -73,7 +73,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
     """Choose the pairs that agree with one rigid transform.
 
     Args:
-        candidates: of each capture, in any order, with all places in the scan where the board may be.
+        candidates: one per capture, in any order, with all places in the scan where the board may be.
         board: the board's size sets the scale at which an angle weighs as much as a distance.
 
     Raises:

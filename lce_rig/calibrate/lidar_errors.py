@@ -36,7 +36,7 @@ class LidarErrors:
     Attributes:
         found: its constant errors; a laser's deviations are about the mean of all lasers.
         prior_sigma: (3,) deviations of a laser's errors about their mean without these sessions.
-        n_captures: by session.
+        n_captures: number of captures of each session.
         n_points: (K,) returns of each laser on boards.
         offset_m: constant error of all ranges, positive if too long; None if not significant.
             It is not part of the lasers' errors in `found`.

@@ -1,16 +1,16 @@
 """Distances of the LiDAR's points and ring ends from the camera's board: residuals and their derivatives.
 
-With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR's leave
+With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR have the residuals
 
     plane     n . (g - R p - t)                                                                          (1)
     ring end  m . (h - R q - t) + d                                                                      (2)
 
 where n is the board's normal and g its middle as the camera sees them, m the outward normal of the edge
-nearest to the ring end and h a point on that edge. Ring ends lie by the edge shift d beyond the print.
+nearest to the ring end and h a point on that edge. Ring ends lie beyond the plate's edge by the edge shift d.
 
 Both are distances along a normal. `CaptureFeatures.board_rows` writes them linear in vec R and t, for moments
 of many points; `differentiate` gives their derivatives by the tangent of (R, t). Algorithm 1, the likelihood,
-the validation, the estimate of time offsets and the guidance take them from here.
+the validation, the time offsets and the guidance use these functions.
 """
 
 from dataclasses import dataclass

@@ -195,7 +195,7 @@ def _causes(
 
     Args:
         names: names of all captures.
-        refused: by name.
+        refused: refusals by capture name.
         plates: findings about the plate's size in all scans.
         session: path, for the commands of actions.
         is_whole: whether to list every capture with its figures.

@@ -133,7 +133,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     _print_changes(plan, show.say)
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
-        show.say("nothing to change: these very files are in place")
+        show.say("nothing to change: these files are already in place")
     for how in dict.fromkeys(plan.changed.values()):
         names = [name for name, change in plan.changed.items() if change == how]
         show.say(f"  {_CHANGES.get(how, how)} {', '.join(names)}")

@@ -65,7 +65,7 @@ class Worker:
         """Call a method of the object, and return its result.
 
         Raises:
-            LceRigError: as the method does; SourceError if its process ends twice.
+            LceRigError: the method raised it; SourceError if its process ends twice.
         """
         with self._lock:
             for _ in range(2):

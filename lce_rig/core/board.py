@@ -32,7 +32,7 @@ class Board:
         marker_share: side of a ChArUco board's markers over that of its squares.
         gap_share: gap between the tags of an AprilGrid over their side.
         dictionary: dictionary of the markers, OpenCV's name without DICT_.
-        first_id: of the markers, at the top left of a ChArUco board and at the lower left of an AprilGrid.
+        first_id: id of the first marker: top left of a ChArUco board, lower left of an AprilGrid.
     """
 
     cols: int

@@ -80,12 +80,12 @@ def unpack(decompressor: Callable[[], Any], packed: bytes, most_bytes: int = MAX
 
     Args:
         decompressor: makes an object with the interface of `bz2.BZ2Decompressor`.
-        packed: the data.
-        most_bytes: most that they may unpack to.
+        packed: compressed data.
+        most_bytes: maximum size after decompression.
 
     Raises:
-        ValueError: they unpack to more.
-        EOFError: they are truncated.
+        ValueError: the data unpack to more.
+        EOFError: the data are truncated.
     """
     pieces, n_bytes = list[bytes](), 0
     while packed:
@@ -118,7 +118,7 @@ class Unpacking:
         """Read up to `size` bytes.
 
         Raises:
-            ValueError: it unpacks to far more than a recording does.
+            ValueError: the file unpacks to far more than a recording does.
         """
         piece = bytes(self._source.read(min(size, _STEP_BYTES)))
         self._n_left -= len(piece)

@@ -40,7 +40,7 @@ _MOST = 1e100
 def _array(rows: Any) -> Array:
     array = np.array(rows, dtype=np.float64)
     if not (np.abs(array) <= _MOST).all():
-        raise ValueError("holds values that are no numbers")
+        raise ValueError("contains values that are not numbers")
     return array
 
 
@@ -52,7 +52,7 @@ def _pose(rows: Any) -> Array:
 def _covariance(rows: Any) -> Array:
     cov = _array(rows)
     if cov.shape != (6, 6) or not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
-        raise ValueError("is no symmetric 6x6 matrix of numbers")
+        raise ValueError("is not a symmetric 6x6 matrix of numbers")
     if np.diag(cov).min() < 0:
         raise ValueError("a variance is negative")
     return cov
@@ -330,9 +330,9 @@ class Calibration:
         method: that found the extrinsics, as `CalibrateOptions.method`.
         uncertainty: `cov` as errors of points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
-        other_cameras: those that saw the same boards held still.
-        intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
-            None for those of the profile.
+        other_cameras: cameras that saw the same boards held still.
+        intrinsics: camera intrinsics that belong to the extrinsics, estimated from the profile's and the
+            session's images; None for the profile's.
         lidar_intrinsics: intrinsics of the second camera; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
@@ -466,7 +466,8 @@ class Provenance:
         date: date of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
             without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
-        imported: when the last capture came into the session, in the same form; only where `date` is None.
+        imported: time at which the last capture entered the session, in the same form; only if `date` is
+            None.
     """
 
     robot: str = ""
@@ -546,7 +547,7 @@ class ResultFile:
             if not all(np.isfinite(value).all() for value in values if isinstance(value, np.ndarray)):
                 raise ResultRefusedError(
                     f"a pose or covariance of {pair.camera} and {pair.lidar} is not finite",
-                    "Add captures: they leave a direction undetermined.",
+                    "Add captures: the present ones leave a direction undetermined.",
                 )
         document: dict[str, Any] = _file().dump_python(self, mode="json", by_alias=True)
         document["inputs_sha256"] = dict(sorted(document["inputs_sha256"].items()))

@@ -25,15 +25,15 @@ class DataSheet:
     """One model of a LiDAR.
 
     Attributes:
-        name: the maker's.
-        source: where the figures are from.
+        name: the maker's name of the model.
+        source: origin of the figures.
         elevations_deg: elevations of each laser, in firing order; empty without rings.
         sequence_ns: time between two firings of one laser; None where the maker fixes `columns` instead.
         columns: firings of each laser per revolution, if they do not depend on the rate.
         firing_ns: time between two groups of lasers of one sequence.
         n_at_once: lasers that fire together.
-        azimuths_deg: of each laser from the rotor's, towards growing azimuth (Velodyne and Hesai count the
-            other way); empty for none.
+        azimuths_deg: azimuth of each laser relative to the rotor, towards growing azimuth (Velodyne and
+            Hesai count the other way); empty for none.
         heights_mm: height of each laser's optical centre; empty for none.
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
         range_m: nearest and farthest return.

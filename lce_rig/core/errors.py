@@ -59,9 +59,8 @@ class NotEnoughDataError(LceRigError):
     """Too few captures, or captures that leave a direction undetermined.
 
     Args:
-        what: as in every error.
-        hint: as in every error.
-        finding: the same as code and figures, where a calibration lacks captures.
+        what, hint: see `LceRigError`.
+        finding: code and figures, if a calibration lacks captures.
     """
 
     exit_code = 6

@@ -31,7 +31,7 @@ def parse_json(data: bytes) -> Any:
     """Parse a JSON document in UTF-8; NaN and Infinity are not JSON.
 
     Raises:
-        ValueError: it is not such a document.
+        ValueError: the data are not such a document.
     """
     return pydantic_core.from_json(data.removeprefix(b"\xef\xbb\xbf"), allow_inf_nan=False)
 
@@ -65,7 +65,7 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise ValueError("it is damaged, too large, or no image that lce-rig reads")
+        raise ValueError("it is damaged, too large, or in an unsupported image format")
     return np.asarray(pixels)
 
 
@@ -105,7 +105,7 @@ def decode_events(data: bytes, sensor: str) -> Events:
     """Read an archive that `encode_events` wrote.
 
     Raises:
-        Exception: as NumPy and zipfile raise it about damaged archives.
+        Exception: raised by NumPy or zipfile for damaged archives.
     """
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         columns = {name: np.asarray(archive[name]) for name in archive.files}

@@ -83,7 +83,7 @@ class Finding:
         code: code of its kind, "family.name".
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
-        figures: by name with units ("rms_m"), for the words and for programs.
+        figures: values by name with unit ("rms_m"), for the text and for programs.
         action: the name of an alternative action of the kind; "" for the usual one.
         follows: the code of the finding that this one follows from; "" for a cause.
         stored: text and action as read from a file; None renders the kind's own.

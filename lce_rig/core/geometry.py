@@ -101,14 +101,14 @@ def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
     """Build a pose from parsed text: four lists of four numbers.
 
     Args:
-        value: as read, of any type.
+        value: parsed value of any type.
         rounding: tolerance on the entries of its rotation, for numbers printed with few digits.
 
     Returns:
         (4, 4), its rotation made exact.
 
     Raises:
-        ValueError: it is not a pose; the text follows the value's name.
+        ValueError: not a pose; the message continues after the value's name.
     """
     is_matrix = isinstance(value, list) and len(value) == 4
     if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in value):

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 EXIT_INTERRUPTED = 130
-INTERRUPTED = "interrupted; what was written so far is whole"
+INTERRUPTED = "interrupted; everything written so far is complete"
 #: Grace period for a clean shutdown. Compiled code and threads may not see the interrupt.
 GRACE_S = 1.2
 # One key press can arrive twice, from the terminal and from a program that passes it on.

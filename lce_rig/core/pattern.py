@@ -47,8 +47,8 @@ def markers_of(board: Board, *, is_legacy: bool = False) -> Markers:
 
     Args:
         board: one that has markers.
-        is_legacy: with the markers of a ChArUco board where OpenCV before 4.6 drew them: its upper left
-            square is white if it has an even number of rows.
+        is_legacy: place the markers of a ChArUco board as OpenCV before 4.6 did: the upper left square is
+            white if the number of rows is even.
     """
     s, (x0, y0) = board.square_m, board.pattern_offset_m
     if board.type == "charuco":

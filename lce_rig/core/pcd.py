@@ -33,7 +33,7 @@ class _Header:
     Attributes:
         dtype: dtype of a point in the file, padding and repeated names included.
         kept: names of the fields that are read, with their names in `dtype`.
-        n_points: as promised.
+        n_points: number of points stated in the header.
         encoding: "ascii", "binary" or "binary_compressed".
     """
 
@@ -121,7 +121,7 @@ def _numbers(entries: dict[str, list[str]], key: str, n: int) -> list[int]:
     """Read the integers of an entry.
 
     Raises:
-        ValueError: it is missing, or has other than n.
+        ValueError: the entry is missing, or does not have n integers.
     """
     words = entries.get(key, [])
     if len(words) != n or not all(word.isdecimal() and len(word) < 16 for word in words):

@@ -28,7 +28,7 @@ def _format(value: Any, spec: str, more: int = 0) -> str:
 
     Args:
         value: the figure; those of a tuple are listed.
-        spec: as in a template.
+        spec: format specification of the template.
         more: digits beyond those of the spec.
     """
     if value is None:
@@ -128,7 +128,7 @@ def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
     Args:
         n_captures: in all.
         is_enough: whether they are predicted to suffice.
-        groups: of each the number, the distance in m, the place in the image if that is aside, and the tilts.
+        groups: number, distance in m, place in the image if off-centre, and tilts of each group.
     """
     placements = []
     for n, distance_m, place, sides in groups:

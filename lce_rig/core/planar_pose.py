@@ -168,8 +168,8 @@ def refine_poses(
 def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
     """Mirror the board's tilt in its line of sight, keeping its centre.
 
-    With S = diag(1, 1, -1) along the line of sight, R' = S R S turns the depth of every board point about the
-    centre's depth, up to the same image under weak perspective.
+    With S = diag(1, 1, -1) along the line of sight, R' = S R S mirrors the depth of every board point
+    about the centre's depth. Under weak perspective the image is the same.
 
     Args:
         T_cam_board: (4, 4).
@@ -228,7 +228,7 @@ def linearise_poses(
     The derivative of a point by the tangent is [I, -(R p)^]. Both are zero for hidden corners.
 
     Args:
-        T_cam_board, corners_px, corners_board, project: as in `refine_poses`.
+        T_cam_board, corners_px, corners_board, project: see `refine_poses`.
     """
     turned = corners_board @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
     pixels, by_point = project(turned + T_cam_board[:, None, :3, 3])

@@ -39,7 +39,7 @@ class EventQuality:
     Attributes:
         events_px_s: events per second and pixel of the board, just before the image.
         events_px: events per pixel of the board in the time that the network remembers.
-        speed_mps, turn_deg_s: of the board about the time of the image.
+        speed_mps, turn_deg_s: speed and rotation rate of the board around the time of the image.
         speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
         smear_m: motion of the board while the LiDAR scans it.
     """
@@ -58,11 +58,11 @@ class LidarQuality:
     """Figures of the plate in a scan.
 
     Attributes:
-        width_m, height_m: of the plate as measured.
+        width_m, height_m: measured size of the plate.
         width_sigma_m, height_sigma_m: standard deviation of these.
         n_rings, n_points: on the plate.
         n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
-        n_ring_ends_dropped: those that do not fit the outline.
+        n_ring_ends_dropped: ring ends that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: rms of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
@@ -180,15 +180,15 @@ class LidarBoard(BoardSurface):
 
     Attributes:
         ring: (N,) int16 of each point.
-        edge_points: (M, 3) first and last point of each ring on the board, as measured, m.
+        edge_points: (M, 3) first and last measured point of each ring on the board, m.
         edge_ring: (M,) int16.
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
         edge_behind_m: (M,) distance behind the board's plane of the ring's next return beyond the edge; inf
             without one. An object close behind blends into the beam's return.
-        edge_echo: (M,) share 0..1 of the received power that comes from that object if a beam meets it and
-            the board alike; 0 without an object. A beam that meets both reports the stronger echo.
-        edge_beam_m: (M, 2) of a board without rings: half the beam's width along the edge's normal, already
+        edge_echo: (M,) fraction 0..1 of the received power from that object if a beam hits it and the board
+            equally; 0 without an object. A beam that hits both reports the stronger echo.
+        edge_beam_m: (M, 2) without rings: half the beam's width along the edge's normal, already
             subtracted from the edge points, as the sum of its width's and height's parts; None with rings.
         edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
             standard deviation; None where the whole border is sharp.
@@ -274,8 +274,8 @@ class Observation:
 
     Attributes:
         capture: the capture's name.
-        pose: pose of the board by the first sensor.
-        surface: by the second.
+        pose: pose of the board in the first sensor.
+        surface: surface of the board in the second.
         others: further places where the second sensor may see it.
     """
 

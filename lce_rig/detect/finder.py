@@ -43,7 +43,7 @@ class Search(Generic[Boards]):
     Attributes:
         located: the board in an image, or the surfaces of its size in a scan, likeliest first, which can be
             followed into the next one; or the refusal.
-        usable: those within the profile's limits, or the refusal.
+        usable: boards within the profile's limits, or the refusal.
     """
 
     located: Boards | Refusal
@@ -103,7 +103,7 @@ class BoardFinder:
         max_reprojection_px: float | None = None,
         is_thorough: bool = True,
     ) -> ImageBoard | Refusal:
-        """Find the board's corners with any intrinsics, without the profile's limits on boards.
+        """Find the board's corners for any intrinsics, without checking the profile's limits for captures.
 
         Args:
             image: image of a camera of the rig.

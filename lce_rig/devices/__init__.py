@@ -33,7 +33,7 @@ def open_live(rig: Rig) -> list[LiveSource]:
         rig: the profile.
 
     Raises:
-        SourceError: as `source_of` does.
+        SourceError: see `source_of`.
     """
     return [source_of(rig, sensor) for sensor in sensors(rig)]
 
@@ -74,7 +74,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
         what = f"{kind} {sensor!r}: driver.type {driver.type!r} is not for a {kind}"
         raise SourceError(what, f"It can be {', '.join(known)}.")
     what = f"{kind} {sensor!r}: no driver goes with model {model!r}"
-    raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if it talks like one of these.")
+    raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if the device is compatible.")
 
 
 def edge_cameras(rig: Rig) -> list[str]:

@@ -269,7 +269,7 @@ def number_of(sensor: str, name: str, value: Value) -> float:
     """Parse a control as a positive number.
 
     Raises:
-        SourceError: it is none.
+        SourceError: not a positive number.
     """
     if isinstance(value, bool | str) or value <= 0:
         what = f"camera {sensor!r}: driver.controls.{name}: {value!r} is not a positive number"
@@ -281,7 +281,7 @@ def bias_of(sensor: str, name: str, value: Value) -> tuple[int, int]:
     """Parse a control as a bias, coarse (0 to 7) and fine (0 to 255): "4,39".
 
     Raises:
-        SourceError: it is none.
+        SourceError: not a bias.
     """
     bias = re.fullmatch(r"\s*([0-7])\s*,\s*([0-9]{1,3})\s*", str(value))
     if bias is None or int(bias[2]) > 255:

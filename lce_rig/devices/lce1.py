@@ -198,12 +198,12 @@ class BoardState:
 
     Attributes:
         reader: reads the lines, and counts damaged ones.
-        n_pulses: pulses handed on, by line.
-        n_lost_by_line: pulses whose messages never came, by line, from gaps in the running numbers.
+        n_pulses: pulses returned, by line.
+        n_lost_by_line: pulses whose messages were lost, by line, from gaps in the sequence numbers.
         n_restarts: restarts of the board.
         restarted_ns: time of the last restart, by the steady clock; None before one.
         heard_ns: time of the last message, or of opening the port, by the steady clock.
-        hello, error: the last of each; None before the first.
+        hello, error: last message of each kind; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: round trip of the last time request.
         host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from

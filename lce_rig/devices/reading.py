@@ -189,7 +189,7 @@ class LiveSource(ABC):
         """Open the device; on return it can be read. After a failure, `close` is called.
 
         Raises:
-            SourceError: it is absent, busy or of another model; the hint says what to check.
+            SourceError: the device is absent, busy or of another model; the hint states what to check.
         """
 
     @abstractmethod
@@ -304,7 +304,7 @@ class AttachedSensors:
     others continue.
 
     Attributes:
-        sources: by the sensor's name.
+        sources: sources by sensor name.
     """
 
     def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float | None = REOPEN_EVERY_S) -> None:
@@ -333,7 +333,7 @@ class AttachedSensors:
         """Open every sensor.
 
         Raises:
-            SourceError: of the first that cannot be opened; its hint names the others.
+            SourceError: a sensor cannot be opened; the hint lists any further ones.
         """
         self.start()
         try:
@@ -343,7 +343,7 @@ class AttachedSensors:
             failures = [source.lost[0] for source in closed if source.lost is not None]
             if failures:
                 hints = [failures[0].hint, *(f"Also: {other.what}" for other in failures[1:])]
-                hints.append("`lce-rig doctor --rig RIG` looks at every device.")
+                hints.append("`lce-rig doctor --rig RIG` checks every device.")
                 raise SourceError(failures[0].what, "\n  ".join(hint for hint in hints if hint))
         except BaseException:  # Ctrl-C while waiting, too.
             self.stop()

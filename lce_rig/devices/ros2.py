@@ -41,7 +41,7 @@ class Ros2Source(LiveSource):
             named, label = settings.topic, f"LiDAR {sensor!r}"
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
-        hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
+        hint = f"Check that its driver publishes: `ros2 topic hz {self._topic}`."
         super().__init__(sensor, label, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
@@ -123,7 +123,7 @@ class Ros2Source(LiveSource):
         """Wait until the topic is published, and return its type without ROS 2's "/msg".
 
         Raises:
-            SourceError: it is not, or is of another type.
+            SourceError: the topic is not published, or is of another type.
         """
         until_s = time.monotonic() + _DISCOVERY_S
         while True:

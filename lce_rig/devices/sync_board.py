@@ -96,7 +96,7 @@ class SyncBoard(LiveSource):
         hello = self._state.hello
         if hello is not None and hello.version != lce1.VERSION:
             raise SourceError(
-                f"{self._label} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
+                f"{self._label} uses version {hello.version} of LCE1, but this program {lce1.VERSION}",
                 "Flash the firmware of this version of lce-rig.",
             )
 
@@ -165,7 +165,8 @@ class SyncBoard(LiveSource):
         """Start the trigger pulses of the cameras; sequence numbers continue.
 
         Args:
-            rate_hz: of all lines instead of the profile's: slow pulses allow images to be matched to pulses.
+            rate_hz: rate of all lines, for slow pulses that images can be matched to; None for the
+                profile's.
         """
         with self._lock:
             self._rate_hz = rate_hz

@@ -213,11 +213,11 @@ class UdpPort:
         """Open the port.
 
         Args:
-            port: its number.
-            what: its use, for messages: "lidar: data packets".
+            port: port number.
+            what: use of the port, for messages: "lidar: data packets".
 
         Raises:
-            SourceError: another program has exclusive use of it, or permission is missing.
+            SourceError: another program uses the port exclusively, or permission is missing.
         """
         self.port = port
         self.n_overflowed = 0

@@ -74,7 +74,7 @@ class SensorChange:
         camera, lidar: the sensors.
         is_new: whether the new set has extrinsics of them.
         rotation_deg, translation_m: between both sets; None if only one of them has extrinsics.
-        verdict, verdict_there: of the new and the deployed result, or "".
+        verdict, verdict_there: verdicts of the new and the deployed result, or "".
     """
 
     camera: str
@@ -132,7 +132,7 @@ class Deployed:
         is_new: whether something changed; False if these very files were in place already.
         output: output of the command that ran afterwards; None if none ran.
         changed_there: files of the earlier release that were not as they were deployed.
-        remarks: as in `Plan`.
+        remarks: see `Plan`.
     """
 
     release: ReleaseRecord
@@ -172,16 +172,16 @@ def deploy(
 ) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
-    If these very files are in place, only a command that has not succeeded yet runs. After any interruption
-    the target holds the earlier set or the new one.
+    If the same files are already in place, only a command that has not succeeded yet runs. After any
+    interruption the target holds the earlier set or the new one.
 
     Args:
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
         session: with images and scans, for formats that show them.
-        reason: for deploying it against objections; it is written down there.
-        place: another way to the target's folder than the target's own.
+        reason: reason for deploying against objections; it is logged at the target.
+        place: replaces the target's own access to its folder.
         announce: receives the changes before anything is refused or changed.
 
     Raises:
@@ -250,9 +250,9 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     """Make an earlier release current again, byte for byte, and run the target's command.
 
     Args:
-        target: where.
+        target: the target.
         name: name of the release; None takes the one that the current release replaced.
-        reason: written down there.
+        reason: reason to log at the target.
 
     Raises:
         TargetError: there is none, its files are not as they were deployed, or the target cannot be reached.
@@ -431,7 +431,7 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     """Run the target's command; return its output, or None without a command.
 
     Raises:
-        CommandError: it failed, or its outcome is unknown; the files are in place.
+        CommandError: the command failed, or its outcome is unknown; the files are in place.
     """
     if target.run is None:
         return None

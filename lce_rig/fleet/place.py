@@ -305,16 +305,16 @@ class Place:
         """Run a script at the place and return its output; raise if it fails.
 
         Raises:
-            LostError: as in `run`.
-            TargetError: it failed.
+            LostError: see `run`.
+            TargetError: the script failed.
         """
         return self.check(self.run(script, *arguments, content=content)).out
 
     def check(self, ran: Ran) -> Ran:
-        """Pass on a script's outcome.
+        """Return a script's outcome if it succeeded.
 
         Raises:
-            TargetError: it failed.
+            TargetError: the script failed.
         """
         if ran.code:
             hint = _HINTS.get(ran.code, "Check space and permissions there.")
@@ -380,7 +380,7 @@ class Place:
         if ran.code == _LOST:
             raise LostError(
                 f"{self.label}: no connection: {_last_line(ran.err)}",
-                "Check that `ssh` reaches it without a question, with the same options (port, key, host).",
+                "Check that `ssh` reaches it without a prompt, with the same options (port, key, host).",
             )
         return ran
 

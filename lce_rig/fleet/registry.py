@@ -76,7 +76,7 @@ SCHEMA = pa.schema([pa.field(name, kind) for name, kind in _TYPES.items()])
 COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
 
 _WRITE_AGAIN = "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
-# Rows per group with minimum and maximum, by which queries skip groups.
+# Rows per group; queries skip groups by their minimum and maximum.
 _ROWS_PER_GROUP = 1 << 16
 # Poses and covariances, most of the bytes, do not compress, so the fastest to read wins.
 _COMPRESSION = "lz4"
@@ -86,7 +86,7 @@ def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mappi
     """Add the columns `PAIR` of each result to its row; figures that are not finite are null.
 
     Args:
-        rows: of one session, as in `ROWS`: one with status "ok" for all results, and one for each camera and
+        rows: rows of one session: one with status "ok" for all results, and one for each camera and
             LiDAR without a result.
         pairs: the results.
         serials: serial numbers by sensor.

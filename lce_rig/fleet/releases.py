@@ -49,13 +49,13 @@ def find_target(name: str, file: Path | None, session: Path, robot: str | None =
 
     Args:
         name: name of the target.
-        file: that lists targets; None for deploy.yaml beside the session.
-        session: its folder.
-        robot: for a target that stands for many.
+        file: file that lists targets; None for deploy.yaml beside the session.
+        session: folder of the session.
+        robot: the robot, for a target shared by several.
 
     Raises:
         ProfileError: the file is invalid.
-        UsageError: the target is unknown, or it stands for many robots.
+        UsageError: the target is unknown, or is shared by several robots and none is named.
     """
     place = file or session.resolve().parent / TARGETS_FILE
     targets = read_targets(place) if file is not None or place.is_file() else {}
@@ -83,8 +83,8 @@ class ReleaseRecord(BaseModel):
         reason: reason of a forced deployment; "" if it was not forced.
         forced: codes of the objections.
         files: SHA-256 of each file by its path.
-        robot, serials, date, session_sha256: as in the result's provenance.
-        verdicts: by camera and LiDAR.
+        robot, serials, date, session_sha256: from the result's provenance.
+        verdicts: verdicts by camera and LiDAR.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
@@ -196,7 +196,7 @@ def read_state(place: Place) -> TargetState:
     if state.named(current) is None:
         raise TargetError(
             f"{place.label}: the record of the current release {current} is damaged",
-            f"Remove the link {place.path}/current there to begin anew.",
+            f"Remove the link {place.path}/current there to start again.",
         )
     return TargetState(state.named(current), state.releases, pending)
 
@@ -205,7 +205,7 @@ def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
     """Copy a release to a new local folder.
 
     Returns:
-        Its files that are not as they were deployed: "changed", "missing", "added" or "no plain file" by
+        The files that differ from those deployed: "changed", "missing", "added" or "no plain file" by
         path. With links, devices or very large files among them nothing is copied.
 
     Raises:

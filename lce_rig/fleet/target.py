@@ -49,7 +49,7 @@ class TargetSettings(Settings):
         robot: the robot there; results of another one are refused.
         formats: export formats; None for the profile's `exports`, else the usual ones.
         run: a command to run there afterwards, by sh; $1 is the robot's name.
-        run_timeout_s: time that it may take.
+        run_timeout_s: time limit of that command.
         ssh: options of ssh_config for the connection, such as Port and IdentityFile.
         keep: number of releases kept, the current one included.
     """

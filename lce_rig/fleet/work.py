@@ -229,7 +229,7 @@ def publish(
     """Write a result's folder and return its rows.
 
     Args:
-        registry: where.
+        registry: the destination.
         rows: rows of one folder, as `with_pairs` describes them.
         start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
@@ -269,10 +269,10 @@ class Ended(NamedTuple):
     """How a session's process ended.
 
     Attributes:
-        rows: its return value; None if it ended before.
-        known: the last row that it sent before it ended.
-        status: "ok" with rows.
-        cause: why there are none.
+        rows: its return value; None if it ended early.
+        known: the last row that it sent early.
+        status: "ok" if it returned rows.
+        cause: the failure; None if it returned rows.
     """
 
     rows: list[Row] | None

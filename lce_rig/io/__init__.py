@@ -56,7 +56,7 @@ def recognise(path: Path) -> str:
         kind = kind_of(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
-        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
+        hint = f"Give a folder with img/ and pcd/, a bag, or an event file ({known})."
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     return kind
 
@@ -72,7 +72,7 @@ def open_recordings(
         options: one for all recordings, or one per path.
 
     Raises:
-        SourceError: as `open_recording`; for a folder only if none of its files can be read.
+        SourceError: see `open_recording`; for a folder, only if none of its files can be read.
     """
     paths, options = list(paths), options or SourceOptions()
     by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options

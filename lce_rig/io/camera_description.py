@@ -299,7 +299,7 @@ def _parse_ini(text: str) -> dict[str, Any]:
             values.setdefault(name, []).extend(numbers)
     if len(values.get("distortion", ())) == 4:
         what = "it has 4 coefficients and names no model"
-        raise ValueError(f"{what}: give the ost.yaml beside it, which says plumb_bob or equidistant")
+        raise ValueError(f"{what}: give the ost.yaml beside it, which names plumb_bob or equidistant")
     flat = {key: numbers[0] if len(numbers) == 1 else numbers for key, numbers in values.items()}
     return {
         **flat,
@@ -313,7 +313,7 @@ def _describe(data: Any, name: str = "", depth: int = 0) -> Iterator[CameraDescr
     """Find the descriptions in plain mappings, which may be nested.
 
     Args:
-        data: as a parser of YAML returns it.
+        data: parsed YAML.
         name: key of the mapping.
         depth: nesting depth of the mapping.
 
@@ -359,7 +359,7 @@ def _one_camera(flat: Mapping[str, Any], K: Array, side: str, name: str) -> Came
     if coefficients is None and side:
         coefficients = _first_numbers(flat, [side + key for key in _COEFFICIENTS])
     if coefficients is None and "camfx" not in flat:
-        raise ValueError("it has a camera matrix, and no distortion_coefficients")
+        raise ValueError("it has a camera matrix, but no distortion_coefficients")
     if coefficients is None:
         # FAST-LIVO2 has a key for each.
         singles = (flat.get(key) for key in chain(*((f"camd{k}", f"k{k + 1}") for k in range(5))))

@@ -28,8 +28,8 @@ _MOST_RINGS = 1024
 # A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
 _MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
 _NO_RINGS_HINT = (
-    "Of a LiDAR that scans in no rings (Livox, solid state), name the model in the profile, or `model: "
-    "unstructured`. Of a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
+    "For a LiDAR without rings (Livox, solid state), name the model in the profile, or set `model: "
+    "unstructured`. For a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
 )
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 

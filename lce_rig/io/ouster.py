@@ -127,7 +127,7 @@ def read_metadata(path: Path) -> OusterMetadata:
     """Read the JSON metadata file that Ouster's tools write beside a recording.
 
     Raises:
-        SourceError: it cannot be read, is not one, or its packets' profile is not read.
+        SourceError: the file cannot be read, is not such a file, or its packet profile is not supported.
     """
     with reading(path, hint="Give the JSON file that the sensor or ouster-cli wrote."):
         document = read_json(path)
@@ -151,8 +151,8 @@ def read_metadata(path: Path) -> OusterMetadata:
         else:
             origin_m = 1e-3 * float(document.get("lidar_origin_to_beam_origin_mm", 0.0)), 0.0
     if name not in PROFILES:
-        hint = f"Read are {', '.join(PROFILES)}; convert it to point clouds with Ouster's own tools."
-        raise SourceError(f"{path}: packets of profile {name} are not read", hint)
+        hint = f"Supported are {', '.join(PROFILES)}; convert others to point clouds with Ouster's own tools."
+        raise SourceError(f"{path}: packets of profile {name} are not supported", hint)
     return OusterMetadata(name, n_columns, columns_per_packet, altitude, azimuth, origin_m, T_sensor_lidar)
 
 

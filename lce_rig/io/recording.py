@@ -338,7 +338,7 @@ def require_sensors(recording: ContinuousRecording, rig: Rig) -> None:
     """Check that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
 
     Raises:
-        SourceError: it does not; the hint names the recording to add.
+        SourceError: a sensor is missing; the hint names the recording to add.
     """
     kinds = {stream.kind for stream in recording.streams}
     holds = ", ".join(f"{stream.kind} of {stream}" for stream in sorted(recording.streams))
@@ -369,7 +369,7 @@ class JoinedRecording:
 
     Attributes:
         path: path of the first recording.
-        notes: those of all, and the skipped sensors.
+        notes: notes of all recordings, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.

@@ -96,8 +96,8 @@ def read_data_packet(
 ) -> DataPacket:
     """Check everything in a payload that its layout determines.
 
-    Ranges and reflectivities can have any value; everything else is bound: flags, azimuths that rise evenly,
-    a time within the hour, known factory bytes.
+    Ranges and reflectivities can have any value; everything else is checked: flags, azimuths that rise
+    evenly, a time within the hour, known factory bytes.
 
     Args:
         payload: payload of the UDP packet.
@@ -187,11 +187,11 @@ _N_WINDOWS = 20
 class VelodyneClock:
     """Relates the sensor's counter, its position packets and the host's clock.
 
-    The counter in the packets runs free from power-up, and looks no different then: only pulses and
-    sentences, which the position packets report, tie it to UTC. The hour is never sent.
+    The counter in the packets runs free from power-up, and looks the same without synchronisation: only
+    pulses and sentences, which the position packets report, relate it to UTC. The hour is never sent.
 
     Attributes:
-        position: the position packet that came last; None before the first.
+        position: last position packet; None before the first.
     """
 
     def __init__(self, is_device_wanted: bool = True) -> None:

@@ -68,7 +68,7 @@ class Setup:
         Shapes are `board_shapes`, and x and y of each corner.
 
         Args:
-            corners_px: as measured.
+            corners_px: measured corners.
             board: the board.
             model: model of the lens.
             prior: prior information of lens and board; None without one of the lens.
@@ -249,7 +249,7 @@ def refit_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) ->
 
     Args:
         setup: K boards.
-        state: with the poses to start from.
+        state: lens, board shape, and initial poses.
         tries_mirror: also start from the mirrored tilt, and keep the better result.
     """
     if not tries_mirror:

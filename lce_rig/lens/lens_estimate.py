@@ -67,10 +67,10 @@ class IntrinsicsEstimate:
         held_out_px: (K,) rms distance of each view's corners under intrinsics fitted without its capture;
             NaN without folds.
         surprise: squared distance of the estimate from the profile's intrinsics, in the standard deviations
-            of these: chi-squared with about four degrees of freedom. None if they had no part in it.
+            of these: chi-squared with about four degrees of freedom. None if they were not used.
         is_contradicted: whether the boards contradict the profile's focal lengths, principal point or
             distortion, which are therefore trusted less than the profile states.
-        refused: name of a view -> why the estimate does not use it.
+        refused: reason why the estimate does not use a view, by its name.
     """
 
     model: LensModel

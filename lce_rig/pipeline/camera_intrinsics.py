@@ -111,11 +111,11 @@ def measure_intrinsics(
 ) -> MeasuredIntrinsics:
     """Fit a camera's intrinsics to the boards in its images.
 
-    The profile's intrinsics only decide which corners look misplaced. If they turn out to be wrong, corners
-    are detected again with the fitted ones.
+    The profile's intrinsics only serve to find misplaced corners. If they prove wrong, corners are detected
+    again with the fitted ones.
 
     Args:
-        session: open for reading is enough.
+        session: session, open for reading.
         camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
@@ -128,7 +128,7 @@ def measure_intrinsics(
     """
     rig = session.rig
     if model not in (None, *MODELS):
-        raise UsageError(f"there is no lens model {model!r}; there is {', '.join(MODELS)}")
+        raise UsageError(f"unknown lens model {model!r}; choose one of: {', '.join(MODELS)}")
     have = rig.cameras[camera].channels
     unknown = sorted(set(channels) - set(have))
     if unknown:
@@ -281,7 +281,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
         The files of this run.
 
     Raises:
-        SessionError: as `replacing`; earlier files are unchanged.
+        SessionError: see `replacing`; earlier files are unchanged.
     """
     place = session.path / INTRINSICS
     names = {f"camera_info_{one.camera}.yaml": one for one in measured}

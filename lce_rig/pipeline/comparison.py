@@ -119,7 +119,7 @@ def _require_same(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions of different rigs, or with other intrinsics.
 
     Raises:
-        SessionError: with the keys.
+        SessionError: the rigs or some keys differ; the message names them.
     """
     (first_name, first), *others = sessions.items()
     for name, session in others:

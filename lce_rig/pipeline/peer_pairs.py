@@ -39,9 +39,10 @@ class SolvedPeers:
     Attributes:
         pair: the sensors.
         n_detected: captures with a board in both.
-        refused: why others are unusable.
-        given: the captures that agree.
-        estimate: estimate of the second one's pose, of LiDARs in an optical frame of the first.
+        refused: why each other capture is unusable.
+        given: the boards of the captures that agree.
+        estimate: pose of the second camera in the first one's frame; of the second LiDAR, in an optical frame
+            at the first.
         validation: validation of the estimate.
     """
 
@@ -99,7 +100,7 @@ def solve_peers(
         pairs: pairs of two LiDARs or two cameras.
         options: options of the estimate; the method is always of maximum likelihood.
         lenses: lenses of cameras that have one already.
-        progress: told what is done.
+        progress: called with each pair.
 
     Returns:
         The results, and for each other pair the cause.

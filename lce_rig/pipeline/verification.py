@@ -139,7 +139,7 @@ def verify(
         session: may differ from the session that the extrinsics come from.
         result: result of `calibrate` or `read_result`; None for the session's result.json.
         name: name of the session's result to check; None for the one in calibration/.
-        profile: with which the result was made, as `profile_behind` finds it: its lenses count.
+        profile: profile that the result was made with (`profile_behind`); its intrinsics are used.
         detections: detections of this session; None to detect the board first.
         progress: called with (done, total) while the board is detected.
 

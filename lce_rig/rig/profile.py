@@ -313,7 +313,8 @@ class Rig(Settings):
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
         mount = self.mount
         for key, root in (("base_frame", self.base_frame), ("mount.of", mount.of if mount else None)):
-            require(root in (None, *roots), f"no sensor has frame {root}; there is {', '.join(roots)}", key)
+            what = f"no sensor has frame {root}; choose one of: {', '.join(roots)}"
+            require(root in (None, *roots), what, key)
         if mount is not None:
             what = f"{mount.parent} is the frame of {used.get(mount.parent)}, not of the robot"
             require(mount.parent not in used, what, "mount.parent")
@@ -356,7 +357,7 @@ class Rig(Settings):
         require(is_whole, "a rig has a camera and a LiDAR, two LiDARs or two cameras", "cameras")
         if self.cameras and self.board.type == "plain":
             what = f"a plain plate has no pattern for {next(iter(self.cameras))}"
-            raise problem(f"{what}; name the print of your board, or remove the cameras", "board.type")
+            raise problem(f"{what}; describe the pattern of your board, or remove the cameras", "board.type")
         used: set[tuple[str, str]] = set()
         for index, entry in enumerate(self.nominal_extrinsics):
             of_lidars = [name for name in self.lidars if name != entry.lidar]
@@ -373,7 +374,7 @@ class Rig(Settings):
             require(pair not in used, what, f"nominal_extrinsics.{index}")
             used.add(pair)
         for name in self.sync.triggers if self.sync else ():
-            what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
+            what = f"no camera is called {name}; choose one of: {', '.join(self.cameras)}"
             require(name in self.cameras, what, f"sync.triggers.{name}")
         return self
 

@@ -100,7 +100,7 @@ class LaserSettings(Settings):
     Attributes:
         ring: the ring's number.
         range_m: positive for ranges too long.
-        azimuth_deg, elevation_deg: by which its true beam deviates from the reported one.
+        azimuth_deg, elevation_deg: deviation of the true beam from the reported one.
     """
 
     ring: Annotated[int, Field(ge=0, le=1000)]
@@ -133,7 +133,7 @@ class LidarSettings(Settings):
 
     Attributes:
         model: maker's name of the model, or "other".
-        serial: serial number of this very unit, for devices that do not report it.
+        serial: serial number of the unit, for devices that do not report it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
         rate_hz: rate of its scans. Without rings, scans that come faster are accumulated to this rate.
@@ -270,7 +270,7 @@ class CameraSettings(Settings):
 
     Attributes:
         model: maker's name of the model.
-        serial: serial number of this very unit, for devices that do not report it.
+        serial: serial number of the unit, for devices that do not report it.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
         resolution_px: (width, height) of the images.

@@ -65,7 +65,7 @@ def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
         if isinstance(error, FileExistsError | NotADirectoryError):
             hint = "Move away what is in its place, or choose another folder."
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            hint = "Choose a folder that you may write to, or see to its permissions."
+            hint = "Choose a folder that you may write to, or change its permissions."
         else:
             hint = "Make room or choose another disk. The same command then goes on where it stopped."
         safe = f" The {n_safe} captures before it are safe." if n_safe else ""

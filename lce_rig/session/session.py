@@ -138,7 +138,7 @@ class Session:
         A session without captures takes the profile, even with differences.
 
         Raises:
-            SessionError: as `create` and `open`, or the session belongs to another rig.
+            SessionError: see `create` and `open`; or the session belongs to another rig.
         """
         path = Path(path)
         if not (path / MARKER).exists():
@@ -168,7 +168,7 @@ class Session:
         Detections whose keys in the cache depend on the changes are computed again.
 
         Args:
-            rig: with the session's name and sensors; board, intrinsics, limits and the like may differ.
+            rig: profile of the same name and sensors; board, intrinsics, limits and the like may differ.
 
         Returns:
             The file of the earlier profile, such as "rig-1.yaml"; "" if both are the same.
@@ -195,7 +195,7 @@ class Session:
         """Return the session, open for reading, with another profile of the same rig; files do not change.
 
         Args:
-            rig: as in `adopt`.
+            rig: see `adopt`.
 
         Raises:
             SessionError: the profile is of another rig.
@@ -219,7 +219,7 @@ class Session:
         """Fill in another profile's robot and serial numbers from this session.
 
         Raises:
-            SessionError: it is of another rig.
+            SessionError: the profile is of another rig.
         """
         foreign = foreign_keys(self.rig, rig)
         if foreign:
@@ -306,7 +306,7 @@ class Session:
         return self.rig.corrected(capture.scan(lidar))
 
     def reject(self, name: str, reason: str = "") -> None:
-        """Reject a capture: it is no longer used, and not collected again.
+        """Reject a capture, so that it is neither used nor collected again.
 
         Args:
             name: name of the capture.

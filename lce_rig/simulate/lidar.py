@@ -153,8 +153,8 @@ _LINE_RAD = np.radians(0.7)
 def _pattern(sheet: DataSheet, starts_ns: NDArray[np.int64]) -> tuple[Array, Array]:
     """Aim the firings (N,) of a LiDAR without rings: azimuth and elevation, rad.
 
-    Two prisms turn the beam by half of the field's radius each: a rosette, densest in its middle. A Mid-360's
-    lines sweep elevation while its rotor turns. Neither repeats within minutes.
+    Two prisms deflect the beam by half of the field's radius each: a rosette, densest in its middle. A
+    Mid-360's lines sweep elevation while its rotor turns. Neither repeats within minutes.
     """
     t_s = 1e-9 * starts_ns
     width, low, high = np.radians(sheet.fov_deg)
@@ -183,7 +183,7 @@ class LidarModel:
         starts_ns: (L,) when each laser fires after the first of its sequence.
         sequence_ns: time between two sequences.
         period_ns: duration of one revolution, or of the scans that are accumulated.
-        pattern: as in the data sheet.
+        pattern: scan pattern, see `DataSheet`.
     """
 
     name: str
@@ -309,7 +309,7 @@ def measure_sweep(
 
     Args:
         sweep: the surfaces.
-        model, noise: as for the sweep.
+        model, noise: those that the sweep was computed with.
         rng: source of all noise.
         laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
         sensor: name in the rig profile.

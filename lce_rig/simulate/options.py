@@ -159,7 +159,7 @@ class SimulationOptions:
         furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
         truth_rotation_deg, truth_translation_m: maximum distance of the true extrinsics from the profile's
             nominal ones; never more than 0.8 of the profile's tolerances.
-        mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
+        mounting_seed: seed of true extrinsics and sensor errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
         motion: whether the board is held still or moved by hand; only a moving one makes events.
         hand: movement of the person's hand.

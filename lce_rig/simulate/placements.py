@@ -166,7 +166,7 @@ def place_board(
         near, far = options.distance_m
         raise LceRigError(
             f"no place for the board {near:g}-{far:g} m before {view.camera} is seen by {view.lidar}",
-            "Check the nominal extrinsic of the profile, or let the board come nearer or go farther.",
+            "Check the nominal extrinsics of the profile, or let the board come nearer or go farther.",
         )
     return fallback
 

@@ -92,9 +92,9 @@ class StagedBoard:
         return Image(camera, channel, stamp_ns, expose(radiance, options.camera, rng), stamp_ns)
 
     def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
-        """Take a scan that begins at a time; every firing meets a moving board at its pose of that moment.
+        """Take a scan that begins at a time; every firing hits a moving board at its pose at that time.
 
-        The carrier stays at its pose of half a revolution.
+        The carrier keeps its pose of mid-revolution.
         """
         stage = self.stage
         T_world_lidar, model, noise = stage.T_world_sensor[lidar], stage.models[lidar], stage.noise[lidar]

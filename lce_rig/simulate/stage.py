@@ -48,7 +48,7 @@ class Stage:
         models: models of each LiDAR.
         noise: the sensor's errors.
         laser_bias_m: (L,) range offset of each laser of each LiDAR.
-        pixels: those of each camera with a channel of events.
+        pixels: event pixels of each camera with a channel of events.
         views: pairs of sensors that the board is placed for in turn.
     """
 
@@ -144,7 +144,7 @@ def set_stage(
         kinds = ("frames", "events")
     cameras = [name for name, camera in rig.cameras.items() if any(map(camera.first_channel, kinds))]
     if rig.cameras and not cameras:
-        hint = "Of a board held still, only frames can be simulated: events need motion."
+        hint = "Only frames can be simulated for a board held still: events need motion."
         raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     eyes = [(name, lenses[name], T_world_sensor[name]) for name in cameras]

@@ -51,8 +51,8 @@ class ClockModel:
         """Build the model of a clock that already shows the reference's time.
 
         Args:
-            sigma_ns: how well it does.
-            origin: why, in words: "PPS locked".
+            sigma_ns: standard deviation of that time.
+            origin: the reason, in words: "PPS locked".
         """
         return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, origin)
 

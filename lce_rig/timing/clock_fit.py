@@ -34,14 +34,15 @@ def fit_clock(
 ) -> ClockModel | None:
     """Fit offset and drift to readings of two clocks, without outliers.
 
-    Only the quickest two fifths of the readings are used. The delay of a reading beyond the quickest one,
-    e_i = bound_i - min bound, shifts its middle by up to +-e_i: fully if the delay was all on one way, not at
-    all if both ways shared it equally. The asymmetry a is a third unknown, common to all readings:
+    Only the quickest two fifths of the readings are used. The delay of a reading beyond the quickest one, e_i
+    = bound_i - min bound, shifts its middle by up to +-e_i: fully if the whole delay was in one direction,
+    not at all if both directions shared it equally. The asymmetry a is a third unknown, common to all
+    readings:
 
         reference_i - source_i = offset + drift t_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)
 
     Without it, answers that become slower would look like a drift. The quickest round trip may be asymmetric
-    too, in the same way every time. Such an error does not scatter; it is stated as
+    too, in the same way every time. Such an error does not scatter; it is reported as
     bias_sigma = min bound / sqrt(3).
 
     Args:

@@ -135,7 +135,7 @@ class RigClock:
     """Puts samples onto the rig's clock, for `collect` and `doctor` alike.
 
     Attributes:
-        models: by the sensor's name, from its clock to the rig's; samples placed earlier keep their time.
+        models: model from each sensor's clock to the rig's; samples placed earlier keep their time.
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:

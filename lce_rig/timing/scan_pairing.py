@@ -64,7 +64,7 @@ class EventCut:
     """A range of one camera's stream.
 
     Attributes:
-        packets: those with its events, at least one event.
+        packets: packets with its events, at least one event.
         start_ns, end_ns: on the events' own clock.
         offset_ns: added to its timestamps to get the rig's time.
         missing_ns: length of its beginning that lies before the stream; 0 if it is complete.
@@ -184,7 +184,8 @@ class Frame:
             time (timestamps plus the profile's expected offsets).
         images: the image of each camera channel that has one within the tolerance.
         scans: the scan of the first LiDAR, if there is one, and of each other with one within the tolerance.
-        events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
+        events: events of each event camera, from 1.2 s before the first scan's first firing to 0.15 s after
+            its last.
     """
 
     time_ns: int

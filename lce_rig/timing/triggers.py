@@ -35,7 +35,7 @@ class TriggeredImage(NamedTuple):
     """An image and the pulse that triggered it.
 
     Attributes:
-        image: as the camera gave it.
+        image: image as received from the camera.
         pulse: running number of the pulse.
         pulse_ns: its rising edge, board time; between its neighbours' where the pulse's line was lost.
         stamp_ns: the moment the image shows, board time: the pulse and the camera's usual delay.

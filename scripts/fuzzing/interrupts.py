@@ -23,7 +23,7 @@ WITHIN_S = 2.0
 _DONE = {"doctor": 5, "repeat": 4}
 _PATIENCE_S = 30.0
 _LONGEST_S = 30.0
-_SAID = "interrupted; what was written so far is whole"
+_SAID = "interrupted; everything written so far is complete"
 
 
 @dataclass

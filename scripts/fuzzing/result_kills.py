@@ -252,7 +252,7 @@ def _kill_once(
         process.wait()
     seconds, text = time.monotonic() - began_s, said(process)
     if number == signal.SIGINT:
-        # Python itself ends with 1 where it is stopped before anything of this program has run.
+        # Python exits with 1 if the signal arrives before any code of lce_rig runs.
         is_ours = process.returncode != 1 or "lce_rig" in text
         if process.returncode not in (0, 130, -signal.SIGINT) and is_ours:
             report.wrong.append(f"{name} ends with {process.returncode} after Ctrl-C: {text[-300:]}")

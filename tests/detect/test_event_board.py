@@ -128,7 +128,7 @@ def test_hot_pixels_do_not_hide_the_board(stream):
         ({"min_event_contrast": 300.0}, "image.low_contrast", "min_contrast"),
     ],
 )
-def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code, figure):
+def test_profile_limits_refuse_with_their_figures(detection, limit, code, figure):
     limits = LIMITS.model_copy(update=limit)
     board = find_image_board(detection[0], BOARD, CAMERA, limits=limits, is_from_events=True)
     if isinstance(board, ImageBoard):

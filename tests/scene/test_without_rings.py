@@ -1,4 +1,4 @@
-"""`drift` and the scene's opinion with a LiDAR that scans in no rings, against a simulated room's truth."""
+"""`drift` with a LiDAR without rings, compared with the truth of a simulated room."""
 
 import json
 from dataclasses import replace

@@ -311,9 +311,9 @@ def descend(
         m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
 
     Args:
-        terms: to start from.
-        reduce: gives the normal equations of terms.
-        move: linearises terms anew after a step z (G,) and y (F, n).
+        terms: terms to start from.
+        reduce: returns the normal equations of terms.
+        move: linearises terms again after a step z (G,) and y (F, n).
         n_steps, short: maximum number of steps; length of the next one that ends them, in standard
             deviations of all unknowns.
 

@@ -1,6 +1,6 @@
 """Likelihood of one camera's captures under assumptions other than those of its estimate.
 
-It serves to judge an estimate. Every placement has full weight, and the images' errors begin at their usual
+For judging an estimate. Every placement has full weight, and the images' errors begin at their usual
 levels. In the estimate, captures that contradict each other lose weight and raise the noise by which they are
 judged. No unknown is held, and priors have no tails.
 """

@@ -26,9 +26,9 @@ class StackedImages:
     """One camera's board poses in P captures.
 
     Attributes:
-        capture: (P,) which of the stacked captures.
+        capture: (P,) index of the stacked capture.
         T_cam_board: (P, 4, 4).
-        cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
+        cov: (P, 6, 6) covariance of the tangent of T_cam_board by corner noise.
         shapes: (P, 6, 6) each, derivative of Q by the square of each of the levels `OF_IMAGES`.
         errors: (P, 6, 3 + n) tangents by which T_cam_board moves per unit of each constant error: squares,
             pattern and the n of the lens, as `layout.BOARD` and optics.

@@ -197,7 +197,7 @@ class State:
     @property
     def fields(self) -> Array:
         """(6,) displacement of the LiDAR's lens, bow of the plate along its width and height, relative error
-        of ranges, and their error by the print."""
+        of ranges, and their error by the pattern's contrast."""
         return self.z[self.layout.fields]
 
     @property

@@ -59,7 +59,8 @@ class RigTerms:
     """All residuals at one state.
 
     Attributes:
-        parts: of each of M LiDARs; the first is the base, and its terms hold the images. All have F captures.
+        parts: terms of each of the M LiDARs, over the same F captures. The first is the base; its terms
+            include the images.
         T_lidar_base: (M, 4, 4) pose of the base in each LiDAR's frame.
     """
 
@@ -267,9 +268,9 @@ def maximise_rig(
         scans: scans of each LiDAR, of F captures; the first is the base.
         images: images of each camera, of the same captures.
         board: the board.
-        states: states of each LiDAR, to start from; the first one's with the cameras' extrinsics.
-        T_lidar_base: (M, 4, 4) to start from.
-        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated anew.
+        states: initial state of each LiDAR; the first includes the cameras' extrinsics.
+        T_lidar_base: (M, 4, 4) initial poses.
+        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated again.
         placement: (F,) number of the placement that each capture shows.
     """
     once = weigh_placements(placement, images)

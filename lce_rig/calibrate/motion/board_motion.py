@@ -113,7 +113,7 @@ def sample_poses(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[
     together they count as one.
 
     Args:
-        scans: with their images; the first image's corners give the orientation of the others.
+        scans: scans with their images; the first image's corners give the orientation of the others.
         clocks: clock settings of the sensors.
         noise_px: corner noise by channel, replacing each image's own.
     """
@@ -281,7 +281,7 @@ def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
     """Move a board's points to their positions at the points' mean firing time.
 
     Args:
-        lidar: with firing times; without them nothing is moved.
+        lidar: board with firing times; without them nothing is moved.
         rates_lidar: (6,) tangent per second (m/s, rad/s) of the board about its middle, frame lidar.
     """
     if lidar.offset_ns is None:

@@ -111,7 +111,7 @@ class Guidance(NamedTuple):
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
         n_least: least number of captures.
         n_more: approximate number of further captures; 0 if there are enough, None if unknown.
-        T_cam_board: (4, 4) wanted; None if no reachable placement is new.
+        T_cam_board: (4, 4) the next placement; None if no reachable placement is new.
     """
 
     n_captures: int
@@ -288,7 +288,7 @@ class Planner:
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
-        # Compute by which fraction the present and the target placement reduce the improvable covariance.
+        # Fraction of the improvable covariance that the present and the target placement remove.
         placements = np.stack([present, wanted])
         model, evidence = self.view.model, self._predictor.weigh(held)
         now = self._predictor.combine(evidence).without_pattern

@@ -284,7 +284,7 @@ class _Loop:
             if not last:
                 self._monitor.cue("refused", "nothing to take back: no capture in this run")
             if not last or key.name not in ("", last):
-                return  # A tap that came late, or twice, means no other capture.
+                return  # A late or repeated tap must not reject another capture.
             # The capture may or may not be on the disk yet.
             taken = self._asked.pop()
             self._keeper.take_back(last)

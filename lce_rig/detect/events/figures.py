@@ -95,7 +95,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
 
     Args:
         measured: figures of the board's events.
-        found: with its track.
+        found: the board, with its track.
         sweep_s: duration of the LiDAR's returns from the board; None without any.
     """
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov

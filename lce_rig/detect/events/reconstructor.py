@@ -74,7 +74,7 @@ class ReconstructionModel:
 
         Args:
             voxels: (bins, H, W) normalised voxel grid.
-            states: as the last step or `initial_states` gave them.
+            states: those returned by the last step, or by `initial_states`.
 
         Returns:
             image (H, W), arbitrary scale; next states.
@@ -182,7 +182,7 @@ class Reconstructor:
 
         Args:
             batches: the stream from its beginning, in time order, cut anywhere.
-            stamps_ns: when images are wanted, never decreasing, the events' clock.
+            stamps_ns: times of the images, never decreasing, on the events' clock.
 
         Raises:
             SourceError: the batches are of different sensors or go back in time.
@@ -211,7 +211,7 @@ class Reconstructor:
             events: up to the next timestamp that an image will be asked for, or shorter.
 
         Raises:
-            SourceError: they are of another sensor or go back in time.
+            SourceError: the events are of another sensor or go back in time.
         """
         if len(events):
             self._advance(self._take(events))

@@ -31,9 +31,10 @@ def nearest_pose(
 ) -> tuple[Array, Array]:
     """Choose the pose with the smallest rotation from T_near (4, 4) among those compatible with an image.
 
-    An image admits two poses. Without markers, the pattern looks the same when rotated by 180 deg, a square
-    one by 90 deg, except for the colours of its squares, which a reconstruction can have wrong: all such
-    turns of both poses are compared. The board must not rotate by half of that between the images.
+    The corners of one image fit two poses. Without markers, a pattern rotated by 180 deg (a square one by 90
+    deg) has the same corners, and the colours of its squares are unreliable in reconstructed images: all
+    these rotations of both poses are compared. Between the images, the board must rotate by less than half
+    of that angle.
 
     Returns:
         T_cam_board (4, 4) and its covariance (6, 6).

@@ -35,8 +35,8 @@ def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossing
 
     Args:
         grey: (H, W).
-        board: with the number of inner corners.
-        is_thorough: whether to go on after the quick attempts, which take a tenth of the total time.
+        board: defines the number and order of the inner corners.
+        is_thorough: whether to continue after the quick attempts, which take a tenth of the total time.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds all of them.
@@ -173,9 +173,9 @@ def to_full_scale(corners: NDArray[Any], scale: float) -> Array:
 def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
     """Find a grid of exactly the given size by linking saddle points of the grey values.
 
-    Each saddle point's two edges point at its neighbours, whose colours are inverted. Points that find each
-    other this way are linked, and the links are followed over the grid. If a corner is missing, or a false
-    one is linked, the function returns None and the finders take over.
+    Each saddle point's two edges point at its neighbours, whose colours are inverted. Pairs that point at
+    each other are linked, and the links are followed over the grid. If a corner is missing, or a false one is
+    linked, the function returns None and the finders take over.
 
     Args:
         grey: (H, W).

@@ -309,7 +309,7 @@ def _measure(
             away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
             is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
             is_trusted, T_cam_board = is_seen, solved.T_cam_board
-        # Patches centred on their corners do not contain neighbouring print.
+        # Patches centred on their corners contain no neighbouring marks.
         grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
     crossings.grid_px[~is_seen] = np.nan
     crossings.is_fitted[...] = is_seen

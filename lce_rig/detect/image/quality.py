@@ -147,11 +147,11 @@ def explain_other_grid(
 ) -> Refusal:
     """Report that the image shows a grid of another size than the profile's, or only part of it.
 
-    The number of corners detected is stated only if they are a whole pattern.
+    The number of detected corners is stated only for a whole pattern.
 
     Args:
         grey: (H, W) the image.
-        board: the board wanted.
+        board: the expected board.
         seen_px: (rows, cols, 2).
         is_from_events: whether the image was reconstructed from events.
     """

@@ -49,7 +49,7 @@ class Patches(NamedTuple):
     Attributes:
         e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
         e2_px: (rows, cols, 2) one unit down on the board.
-        clear: distance from an edge, in units, up to which the surroundings are free of other print.
+        clear: distance from an edge, in units, up to which there are no other marks.
     """
 
     e1_px: Array

@@ -205,7 +205,7 @@ class Beam:
 
     Attributes:
         aperture_m: width of the beam at the sensor's exit.
-        divergence_rad: full angle by which it widens.
+        divergence_rad: full divergence angle.
         upright_rad: the same upwards; None for the same as sideways.
     """
 
@@ -226,9 +226,9 @@ class Beam:
 def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple[Array, float]:
     """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
 
-    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
-    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales of
-    the returns' scatter about the first plane.
+    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would rotate
+    the plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales
+    of the returns' scatter about the first plane.
 
     Args:
         points: (N, 3) m, frame lidar.
@@ -275,7 +275,7 @@ def refine(
         placement: first guess of the outline.
         limit_m: largest error of an outline; a worse one is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, for further work.
-        dark_m, may_be_hidden: as in the view.
+        dark_m, may_be_hidden: see `PlaneView`.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None if too few returns lie
@@ -363,7 +363,7 @@ def build_board(
         beyond_share=float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
         distance_m=distance_m,
     )
-    # The share of the power that comes from behind where a beam meets it and the board alike. Intensities
+    # Fraction of the power from the background if a beam hits it and the board equally. Intensities
     # are those of surfaces; the power received falls with the square of the range.
     intensity = source.intensity[scan.index].astype(np.float64)
     of_board = float(np.median(intensity[border])) if len(border) else 0.0

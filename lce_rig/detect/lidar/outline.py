@@ -1,13 +1,13 @@
 """Fit a rectangle to rays near a plate, by the likelihood of returns on the plate and beside it.
 
-A ray that meets the plate's plane at u returns from the plate with the probability
+A ray that hits the plate's plane at u returns from the plate with the probability
 
     P(u) = eps + (1 - 2 eps) prod_e Phi(-s_e(u) / w_e)                                                    (1)
 
 with s_e the distance beyond side e and w_e the blur across it: half the beam's width there and the noise of
 directions. Rays that return from behind, or from nowhere, passed beside the plate; those that return from
-before it say nothing. The unknowns are the rectangle's place, turn, and the growth of its width and height,
-as beams wider than a point return from a plate that they only touch.
+before it are not used. The unknowns are the rectangle's position, rotation, and excess width and height:
+wide beams return from a plate that they only graze.
 """
 
 from collections.abc import Callable
@@ -60,7 +60,7 @@ class Outline(NamedTuple):
     """A rectangle fitted to rays.
 
     Attributes:
-        placement: with the nominal size; `error_m` is the mean of -ln P over the rays near the border.
+        placement: fit of the nominal size; `error_m` is the mean of -ln P over the rays near the border.
         growth_m: (2,) excess of half its width and half its height over the nominal ones.
         cov: (5, 5) of u, v, angle and growth.
     """

@@ -268,7 +268,7 @@ def _past_dark_squares(
 
     Args:
         scan: all returns.
-        board, start, limits, max_beyond: as in `measure_plate`.
+        board, start, limits, max_beyond: see `measure_plate`.
 
     Returns:
         As `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.

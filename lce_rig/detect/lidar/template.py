@@ -127,7 +127,7 @@ def view_plane(
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
         radius_m: radius of the disc examined.
-        tolerance_m, dark_m: as in the view.
+        tolerance_m, dark_m: see `PlaneView`.
     """
     normal, d = plane[:3], plane[3]
     origin = centre - (centre @ normal + d) * normal

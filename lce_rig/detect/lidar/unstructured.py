@@ -263,7 +263,7 @@ class _View(PlaneView):
         """Separate rays that return from the plate from those that pass beside it.
 
         Rays that return from before the plane, or just behind it where echoes of plate and background blend,
-        are left out, except that a stand or a touching object ends the plate. Places without any return count
+        are skipped, except that a stand or a touching object ends the plate. Places without any return count
         as passed, unless they lie on a first placement.
 
         Args:

@@ -109,7 +109,7 @@ class EventRecording:
 
         Raises:
             NoEventsError: no events.
-            SourceError: those of a camera of another resolution.
+            SourceError: the events are of a camera of another resolution.
         """
         self.path = path
         self.sensor = sensor

@@ -51,7 +51,7 @@ class BagFile:
 
     Attributes:
         path: the file or folder.
-        files: those of the bag that hold messages.
+        files: files of the bag that hold messages.
         topics: (message type, number of messages) by topic.
         damages: errors of files that cannot be opened, beside others that can.
         end_ns: when the recorder received the last message.

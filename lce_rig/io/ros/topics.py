@@ -140,7 +140,7 @@ def choose_topics(
             take(target, topic, f", the only topic with {what}")
             continue
         fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}"
-        hint = f"{there}. Say which with --topic {target}=TOPIC, or set topic in the profile."
+        hint = f"{there}. Choose one with --topic {target}=TOPIC, or set topic in the profile."
         failures.append(SourceError(f"{path}: {fault} for {target}", hint))
     if failures and not (options.is_part and chosen):
         raise failures[0]
@@ -151,7 +151,7 @@ def _list_targets(rig: Rig, options: SourceOptions) -> tuple[dict[Target, str | 
     """List the rig's sensors with their topics from the profile, and the requested topics.
 
     Raises:
-        SourceError: a topic was asked for a sensor that the rig does not have.
+        SourceError: a topic is given for a sensor that the rig does not have.
     """
     targets: dict[Target, str | None] = {
         Target(name, channel, settings.kind == "events"): settings.topic
@@ -245,7 +245,7 @@ def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic
             raise
     sensors, skipped = [], [] if skipped is None else skipped
     skipped += [
-        f"{topic}: skipped, {kind} is not read: record raw or compressed images"
+        f"{topic}: skipped, {kind} is not supported: record raw or compressed images"
         for topic, kind in types.items()
         if _VIDEO.search(kind)
     ]

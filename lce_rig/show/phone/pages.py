@@ -151,7 +151,7 @@ _HEADERS = {
 
 
 class Feed:
-    """Holds only the newest state; a slow reader misses those in between. Requests go the other way."""
+    """Passes states to the page, and requests back. Only the newest state is kept."""
 
     def __init__(self) -> None:
         self._newest: tuple[int, float, LiveState] | None = None

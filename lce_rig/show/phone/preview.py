@@ -30,13 +30,13 @@ def parse_address(text: str) -> tuple[str, int]:
     """Parse an address: "host:port", "host" or "port"; this computer alone and port 8765 by default.
 
     Raises:
-        UsageError: it is none of these.
+        UsageError: the text has another form.
     """
     host, colon, port = text.strip().partition(":")
     if not colon and host.isdecimal():
         host, port = "", host
     if re.search(r"[\s/\[\]]", host) or not re.fullmatch("[0-9]{0,5}", port) or int(port or 0) > 65535:
-        raise UsageError(f"{text!r} is no address for a page", _HINT)
+        raise UsageError(f"{text!r} is not an address for the page", _HINT)
     return host or LOOPBACK, int(port or DEFAULT_PORT)
 
 
