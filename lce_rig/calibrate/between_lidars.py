@@ -7,7 +7,7 @@
 The boards' poses by the first LiDAR are compared with the second one's points and ring ends.
 
 A plate without a pattern looks the same rotated by 180 deg, a square one by 90 deg. Normals and middles of
-several boards decide T_12 without that turn, which then follows by capture.
+several boards determine T_12 despite this ambiguity, which is then resolved for each capture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,8 +48,9 @@ class PlacedBoards:
 
     Attributes:
         T: (F, 4, 4) T_lidar_board.
-        cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
-        joint: the estimate they are of.
+        cov: (F, 6, 6) of each pose by errors that differ between captures, tangent (translation m, rotation
+            rad).
+        joint: the estimate that contains them.
     """
 
     T: Array
@@ -156,7 +157,7 @@ def optical_frame(middles: Array) -> Array:
     """Rotate the axes of a LiDAR (x forward, z up) to a camera's (z forward, y down) facing the boards.
 
     Args:
-        middles: (F, 3) of the boards, frame of the LiDAR.
+        middles: (F, 3) middles of the boards, frame of the LiDAR.
 
     Returns:
         T_optical_lidar (4, 4).
@@ -182,7 +183,7 @@ def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
     """Choose the rotation (4, 4) about the plate's normal that brings pose `other` closest to T (4, 4).
 
     Returns:
-        The turn, and the angle about the normal that is left, rad.
+        The rotation, and the remaining angle about the normal, rad.
     """
     sides = board.width_m, board.height_m
     n_fold = 4 if max(sides) < (1 + _NEARLY_SQUARE) * min(sides) else 2

@@ -23,7 +23,7 @@ BY_ALGORITHM_1 = "algorithm_1"
 class Sensitivity:
     """Effect of a profile error on the extrinsics when used with the result's intrinsics.
 
-    Or the moves that would resolve a check's contradiction: the covariance holds both sides.
+    Also the moves that would resolve a contradiction found by a check: the covariance includes them.
 
     Attributes:
         source: the erroneous quantity, or the check.
@@ -138,7 +138,7 @@ def report(
     """Measure the residuals of extrinsics and assemble the estimate.
 
     Args:
-        start: the captures, and where the estimate began.
+        start: the captures and the initial guess.
         T_cam_lidar: (4, 4).
         cov: (6, 6) of it, tangent (translation m, rotation rad).
         board: the board.

@@ -69,7 +69,7 @@ class _Seen:
     Attributes:
         pair: the sensors.
         capture: the capture's name.
-        boards: in the scan of each LiDAR.
+        boards: boards in the scan of each LiDAR.
         image: image of the camera; None for two LiDARs.
     """
 

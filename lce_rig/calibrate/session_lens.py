@@ -8,7 +8,7 @@ the extrinsics are estimated with these poses. The covariance of lens and board 
     cov = cov_T|K + J cov_K J^T,    cov_K' = J cov_K,    J = dT / dK + W                                   (1)
 
 Extrinsics and intrinsics of a result are used together. An error of the intrinsics that projects like a
-rotation W of the camera turns the extrinsics back by nearly as much; W in J keeps the difference.
+rotation W of the camera rotates the extrinsics back by nearly as much; W in J keeps the difference.
 """
 
 from collections.abc import Mapping, Sequence

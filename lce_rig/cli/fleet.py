@@ -105,7 +105,7 @@ def run(
     Each session is one task of a Dask cluster: detect, calibrate, verify, write. Results that the registry
     holds already, of the same captures, profile and version, are kept. Run it again after an interrupt to
     continue. A session that fails, takes too long, crashes or needs too much memory is recorded with the
-    cause and stops no other. Nothing below ROOT is written.
+    cause; others continue. ROOT is not written to.
     """
     from lce_rig.fleet.jobs import find_jobs
     from lce_rig.fleet.run import cluster, run_fleet

@@ -112,8 +112,8 @@ def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterat
 def view(session: Path, name: str | None, capture: str | None, output: Path | None) -> None:
     """Show the point cloud of SESSION (default: session/) in the colours of its cameras.
 
-    With wrong extrinsics, edges of things have the colours of their background. Points that no camera sees
-    are grey. Drag to turn, scroll to zoom; N and P change to the next and the previous capture.
+    With wrong extrinsics, edges of objects have the colours of their background. Points that no camera sees
+    are grey. Drag to rotate, scroll to zoom; N and P change to the next and the previous capture.
 
     Exits with 5 without a display, or if Open3D cannot open a window.
     """

@@ -47,9 +47,9 @@ class CollectReport:
 
     Attributes:
         captured: names of the new captures.
-        n_known: pairs and moments that the session holds already, among rejected captures too.
+        n_known: pairs and moments already in the session, rejected captures included.
         refused: refusals of image-scan pairs, by label.
-        counts: refusals of moments of continuous recordings, counted.
+        counts: number of refusals of moments of continuous recordings, by cause.
         notes: choices, assumptions and skipped data, in words.
         errors: recordings that could not be read to their end; captures made before are kept.
         n_missing: captures short of the target.
@@ -133,7 +133,7 @@ class _Collector:
         """Capture every pair of a folder.
 
         Raises:
-            SourceError: not one pair could be read; its cause is that of the first.
+            SourceError: no pair could be read; the cause is that of the first.
         """
         failures: list[SourceError] = []
         n_left_out = 0
@@ -201,7 +201,7 @@ class _Collector:
         """Yield confirmed moments: selected by motion in recordings with events, else by stillness.
 
         Args:
-            recording: is read once.
+            recording: recording, read once.
             cameras: cameras with events and without images.
             has_events: whether events are kept with captures, so that the board has to move.
         """

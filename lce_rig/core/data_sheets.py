@@ -95,7 +95,7 @@ class DataSheet:
     def rings_rad(self) -> Array:
         """The elevation of each ring (L,), from the lowest.
 
-        Without rings, that of lines about as far apart as returns, from which guidance predicts its figures.
+        Without rings, virtual lines with the density of the returns, for the guidance's predictions.
         """
         if not self.has_rings:
             low, high = self.fov_deg[1:]
@@ -135,7 +135,7 @@ TYPICAL = DataSheet(name="other", source="typical of spinning LiDARs", elevation
 def find_data_sheet(model: str) -> DataSheet | None:
     """Find a model by name in any spelling; None if unknown.
 
-    "VLP-16", "vlp16" and "Velodyne VLP 16 (Puck)" are one model; words behind a known name do not matter.
+    "VLP-16", "vlp16" and "Velodyne VLP 16 (Puck)" are one model; words after a known name are ignored.
     """
     words = model.split()
     names = (" ".join(words[:n]) for n in range(len(words), 0, -1))

@@ -106,7 +106,7 @@ def reading(
     Devices, pipes and files that are too large are refused before they are opened.
 
     Libraries raise errors of many kinds for a damaged file: KeyError, struct.error, RuntimeError and errors
-    of their own. An LceRigError passes: it names its cause already. So do errors that only a bug in
+    of their own. An LceRigError passes, as it already names its cause. So do errors that only a bug in
     lce-rig can raise.
 
     Args:

@@ -21,8 +21,8 @@ def read_json(path: Path) -> Any:
     """Read a JSON document from a file; see `parse_json`.
 
     Raises:
-        OSError: it is not there, or cannot be read.
-        ValueError: it is not JSON.
+        OSError: the file is missing, or cannot be read.
+        ValueError: the file is not JSON.
     """
     return parse_json(path.read_bytes())
 
@@ -49,7 +49,7 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
         (H, W) or (H, W, C), as OpenCV decodes it.
 
     Raises:
-        ValueError: it is truncated, damaged, or no image.
+        ValueError: the data are truncated, damaged, or not an image.
     """
     import cv2
 
@@ -75,7 +75,7 @@ def encode_events(events: Events) -> bytes:
     Timestamps are stored in microseconds (t_us) if all are whole ones, else in nanoseconds (t_ns).
 
     Returns:
-        The bytes of an .npz file, for its owner to put in place in one step.
+        The bytes of an .npz file, to be written in one step.
     """
     is_whole = not np.any(events.t_ns % _NS_PER_US)
     columns: dict[str, NDArray[Any]] = {

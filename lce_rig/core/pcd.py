@@ -1,7 +1,7 @@
 """Point clouds as PCD files from any writer.
 
 Headers are read as PCL reads them: any white space separates fields, and COUNT and POINTS may be missing.
-pypcd4 refuses such files, and reserves memory for as many points as a header promises.
+pypcd4 refuses such files, and allocates memory for as many points as a header states.
 
 References:
     https://pointclouds.org/documentation/tutorials/pcd_file_format.html
@@ -54,7 +54,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
         several fields of one name is read.
 
     Raises:
-        ValueError: it is not a PCD file, or damaged, or holds fewer points than its header promises.
+        ValueError: not a PCD file, damaged, or with fewer points than the header states.
     """
     if not data:
         raise ValueError("it is empty")

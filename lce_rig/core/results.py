@@ -60,13 +60,14 @@ class LidarQuality:
     Attributes:
         width_m, height_m: measured size of the plate.
         width_sigma_m, height_sigma_m: standard deviation of these.
-        n_rings, n_points: on the plate.
-        n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
+        n_rings, n_points: number of rings and points on the plate.
+        n_ring_ends: number of ring ends at its outline; without rings, of located border pieces of about 7
+            cm.
         n_ring_ends_dropped: ring ends that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: rms of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
-        beyond_share: returns in the plane beyond the outline over those on the plate.
+        beyond_share: ratio of returns in the plane beyond the outline to those on the plate.
         distance_m: distance of the plate's middle.
     """
 
@@ -122,8 +123,8 @@ class ImageBoard(BoardPose):
     """The board detected in one image; T_cam_board has the smaller reprojection error.
 
     Attributes:
-        corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, of boards whose
-            markers name the corners.
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, for boards
+            with markers.
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -131,7 +132,7 @@ class ImageBoard(BoardPose):
         stamp_ns: timestamp of the image; None if the recording carries no time.
         track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
             the board was tracked; None if there are none.
-        track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
+        track_T_cam_board: (K, 4, 4) poses in these images, for the same order of corners.
         track_cov: (K, 6, 6) of those poses, as `cov`.
     """
 
@@ -161,7 +162,7 @@ class BoardSurface:
     Attributes:
         points: (N, 3) on the board as measured, m.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the sensor (d > 0).
-        T_lidar_board: (4, 4) of the board in the sensor's frame; from a scan it is known up to the symmetries
+        T_lidar_board: (4, 4) of the board in the sensor's frame; a scan determines it up to the symmetries
             of a rectangle.
     """
 

@@ -42,7 +42,7 @@ def source_of(rig: Rig, sensor: str) -> LiveSource:
     """Build the source of one sensor; it opens with its `with` block.
 
     Raises:
-        SourceError: its driver's type belongs to another kind of sensor.
+        SourceError: the driver's type belongs to another kind of sensor.
     """
     module, name = LIVE[driver_of(rig, sensor)].split(":")
     make: Any = getattr(import_module(module), name)
@@ -54,7 +54,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
     """Name the driver that reads a sensor: the profile's, else the default of its model.
 
     Raises:
-        SourceError: there is none.
+        SourceError: no driver fits the model.
     """
     if sensor == BOARD:
         return "sync_board"

@@ -50,7 +50,7 @@ class ImagePipeSource(LiveSource):
         """Start the command.
 
         Raises:
-            SourceError: there is none, or it cannot be started.
+            SourceError: there is no command, or it cannot be started.
         """
         command = self._settings.driver.command
         if not command:
@@ -72,7 +72,7 @@ class ImagePipeSource(LiveSource):
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
-                start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
+                start_new_session=True,  # Ctrl-C reaches only this program, which then stops the command
             )
         except OSError as error:
             hint = "Install the program, or give its full path."

@@ -32,8 +32,8 @@ class SourceStatus:
 
     Attributes:
         sensor: the sensor's name in the profile.
-        n_samples: samples handed on since it was opened.
-        n_dropped: samples dropped because they were not taken in time.
+        n_samples: samples delivered since opening.
+        n_dropped: samples dropped because they were not read in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
         rate_hz: samples per second over the last seconds; 0 before the second sample.
         clock: clock of the timestamps, and its relation to others; None before the first sample.
@@ -84,8 +84,8 @@ class Inbox(Generic[T]):
 
         Args:
             sender: sender of the items.
-            items: in order.
-            n_slots: most items of this sender that may wait; beyond, the oldest is dropped.
+            items: items in order.
+            n_slots: maximum number of waiting items of this sender; beyond, the oldest is dropped.
         """
         with self._changed:
             for item in items:
@@ -197,7 +197,7 @@ class LiveSource(ABC):
         """Return the received samples; waits briefly at most.
 
         Raises:
-            SourceError: the device failed for good.
+            SourceError: the device failed permanently.
         """
 
     @abstractmethod
@@ -217,8 +217,8 @@ class LiveSource(ABC):
         """Start a thread that opens the device and reads it into a queue.
 
         Args:
-            inbox: takes the samples.
-            reopen_every_s: between attempts to open a lost device again; None for none.
+            inbox: receives the samples.
+            reopen_every_s: interval between attempts to reopen a lost device; None for no attempts.
         """
         self._inbox, self.lost, self.opened_s, self._rate = inbox, None, None, RateMeter()
         self._stopping.clear()

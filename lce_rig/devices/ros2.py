@@ -24,8 +24,8 @@ _DISCOVERY_STEP_S = 0.1
 class Ros2Source(LiveSource):
     """A topic of sensor_msgs/Image, CompressedImage or PointCloud2; see `LiveSource`.
 
-    Messages arrive serialised and are decoded as those of a bag are. The topic is the profile's for bags.
-    Timestamps are those of the headers, which are as good as the publishing driver makes them.
+    Messages arrive serialised and are decoded like those of a bag. The topic is the profile's topic for bags.
+    Timestamps are those of the headers; their quality depends on the publishing driver.
 
     Args:
         sensor: the sensor's name in the profile.
@@ -54,7 +54,7 @@ class Ros2Source(LiveSource):
         """Join the ROS graph and subscribe.
 
         Raises:
-            SourceError: rclpy cannot be imported, the profile names no topic, or nothing publishes it.
+            SourceError: rclpy cannot be imported, the profile names no topic, or no node publishes it.
         """
         if not self._topic:
             block = "cameras" if self._target.channel is not None else "lidars"

@@ -52,8 +52,8 @@ class ExportJob:
     Attributes:
         calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
-        folder: for the files.
-        robot: the robot's own tree of frames; None where outputs hang from the profile's `mount` or root.
+        folder: folder for the files.
+        robot: the robot's own tree of frames; None if outputs hang from the profile's `mount` or root.
         session: source of images and scans; None if only results are available.
         findings: content that the outputs omit or change, and why; grows.
     """
@@ -258,7 +258,7 @@ def remove_exports(folder: Path) -> None:
     """Remove exports of earlier runs from a folder, recognised by their first lines.
 
     Raises:
-        SessionError: one cannot be removed.
+        SessionError: a file cannot be removed.
     """
     for path in sorted(folder.glob("*")):
         if is_export(path):
@@ -279,7 +279,7 @@ def is_export(path: Path) -> bool:
     """Check whether lce-rig wrote a file, by its first lines, or a bag, by its metadata.
 
     Raises:
-        SessionError: it cannot be read.
+        SessionError: the file cannot be read.
     """
     if path.is_symlink():
         return False

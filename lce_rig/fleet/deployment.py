@@ -1,6 +1,6 @@
 """Deploy a result to a target, query its state, and restore an earlier release.
 
-`plan` lists changes and objections, `deploy` makes the changes, `standing` asks for the state, `rollback`
+`plan` lists changes and objections, `deploy` makes the changes, `standing` queries the state, `rollback`
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
@@ -127,11 +127,11 @@ class Deployed:
     """The outcome of a deployment or a rollback.
 
     Attributes:
-        release: that is current now.
+        release: the current release.
         replaces: the release that was current before; "" for the first.
-        is_new: whether something changed; False if these very files were in place already.
+        is_new: whether something changed; False if the same files were already in place.
         output: output of the command that ran afterwards; None if none ran.
-        changed_there: files of the earlier release that were not as they were deployed.
+        changed_there: files of the earlier release that had been changed at the target.
         remarks: see `Plan`.
     """
 
@@ -231,7 +231,7 @@ def standing(target: TargetSettings) -> TargetState:
     """Query the state of a target, and whether its current files are unchanged since deployment.
 
     Raises:
-        TargetError: it cannot be reached or read.
+        TargetError: the target cannot be reached or read.
     """
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         return _standing(Place(target), Path(folder) / "deployed")
@@ -255,7 +255,7 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
         reason: reason to log at the target.
 
     Raises:
-        TargetError: there is none, its files are not as they were deployed, or the target cannot be reached.
+        TargetError: there is no such release, its files were changed, or the target cannot be reached.
         CommandError: the command failed; the earlier files are in place.
     """
     place = Place(target)
@@ -394,7 +394,7 @@ def _commit(
     """Make a release current.
 
     Raises:
-        TargetError: another one has become current since, or the target cannot be written or reached.
+        TargetError: another release has become current meanwhile, or the target cannot be written or reached.
     """
     entry = {
         "time": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",

@@ -79,7 +79,7 @@ DEPLOY_OTHER_RIG = Kind(
 DEPLOY_MOVED = Kind(
     "deploy.moved",
     "{subject} would move by {rotation_deg:deg}, {translation_m:mm} (limit {limit_deg:deg}, {limit_m:mm})",
-    "Check the result, `lce-rig verify {session}`, or force it and state the reason.",
+    "Check the result, `lce-rig verify {session}`, or force it with a reason.",
 )
 DEPLOY_WORSE = Kind(
     "deploy.worse",
@@ -89,7 +89,7 @@ DEPLOY_WORSE = Kind(
 DEPLOY_OTHER_SERIAL = Kind(
     "deploy.other_serial",
     "{subject} has serial number {serial}, the deployed one {there}",
-    "Name the right target. If the sensor was replaced, force it and state the reason.",
+    "Name the right target. If the sensor was replaced, force it with a reason.",
 )
 DEPLOY_OLDER = Kind(
     "deploy.older",

@@ -75,7 +75,7 @@ class ReleaseRecord(BaseModel):
 
     Attributes:
         format_version: format version of this schema.
-        name: name of the release: time of deployment, UTC, and the begin of `set_sha256`.
+        name: name of the release: UTC time of deployment, and the beginning of `set_sha256`.
         time: time of deployment, by the clock of the computer that deployed it.
         by: user@computer that deployed it.
         made_by: the program that wrote the files.
@@ -147,10 +147,10 @@ class TargetState:
     """The state of a target.
 
     Attributes:
-        current: read by robot software; None before the first deployment.
-        releases: all that are kept, the newest first.
+        current: release read by robot software; None before the first deployment.
+        releases: all kept releases, newest first.
         pending: the release whose command has not succeeded yet, or "".
-        changed: current files that differ from the deployed ones, and how they differ; empty if not asked.
+        changed: current files that differ from the deployed ones, and how they differ; empty if not checked.
     """
 
     current: ReleaseRecord | None = None
@@ -172,7 +172,7 @@ def read_state(place: Place) -> TargetState:
     """Query the state of a target, without changing it.
 
     Raises:
-        TargetError: it cannot be reached, or `current` or `releases` are not those of lce-rig.
+        TargetError: the target cannot be reached, or `current` or `releases` is not by lce-rig.
     """
     current, pending, releases = "", "", []
     for line in place.must_run(STATE).splitlines():

@@ -1,6 +1,6 @@
 """Deploy the newest results of many robots, one robot after the other, until the first failure.
 
-Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
+A roll-out stores no state: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.
 """
 

@@ -25,7 +25,7 @@ class Storage:
     reports: missing credentials, no network, no permission.
 
     Attributes:
-        url: absolute; without a slash at its end.
+        url: absolute address, without a trailing slash.
     """
 
     url: str

@@ -85,7 +85,7 @@ class TargetSettings(Settings):
         """Insert a robot's name for {robot}; results of other robots are then refused.
 
         Raises:
-            ValueError: no robot can have this name.
+            ValueError: the robot's name is invalid.
         """
         values = {"to": self.to.replace(ROBOT_FIELD, robot), "robot": self.robot or robot}
         return TargetSettings.model_validate(self.model_dump() | values)

@@ -48,7 +48,7 @@ def recognise(path: Path) -> str:
     """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag counts as a bag.
 
     Raises:
-        SourceError: nothing is there, or no recording.
+        SourceError: the path is missing, or not a recording.
     """
     if not path.exists():
         raise SourceError(f"{path} does not exist")
@@ -101,9 +101,9 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     or a camera of the profile belongs to it.
 
     Args:
-        path: a folder, such as `lce-rig collect --record` fills, or any recording.
+        path: a folder, such as one of `lce-rig collect --record`, or any recording.
         rig: the profile.
-        options: for reading, unless file names choose the sensor.
+        options: options for reading, unless file names choose the sensor.
     """
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [(path, options)]

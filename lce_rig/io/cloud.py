@@ -226,8 +226,8 @@ def to_scan(
 def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
     """Check which Livox tags (N,) mark a return as noise with high or moderate confidence.
 
-    Bits 0-1 judge by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the Mid-360
-    and the HAP on they mark returns between near objects: those that bleed over an edge.
+    Bits 0-1 classify by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the
+    Mid-360 and the HAP on they mark returns between near objects: points that bleed over an edge.
 
     References:
         Livox Wiki, point cloud characteristics: tag information.

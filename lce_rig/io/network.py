@@ -40,7 +40,7 @@ class Datagram:
         host_ns: arrival at the host; 0 where unknown.
         source: IP address of the sender.
         source_port, port: UDP ports it was sent from and to.
-        payload: its content.
+        payload: content of the datagram.
     """
 
     host_ns: int
@@ -55,7 +55,7 @@ class PcapFile:
 
     Attributes:
         path: the file.
-        losses: datagrams that are not whole; grows while the file is read.
+        losses: incomplete datagrams; grows while the file is read.
         damage: the reason if the file could not be read to its end, else "".
     """
 

@@ -70,7 +70,7 @@ class OusterMetadata:
         name: name of its profile.
         n_columns: columns of a revolution.
         columns_per_packet: columns of one packet.
-        altitude_rad, azimuth_rad: (L,) of each beam, from the top.
+        altitude_rad, azimuth_rad: (L,) angles of each beam, from the top.
         origin_m: (2,) distance of the beams' origins from the axis, and their height.
         T_sensor_lidar: (4, 4), m.
     """
@@ -104,7 +104,7 @@ class OusterMetadata:
     def to_points(self, column: NDArray[np.int64], range_m: Array) -> NDArray[np.float32]:
         """Compute points (C, L, 3), m, of columns (C,) with ranges (C, L), in the sensor's frame.
 
-        Cartesian coordinates of the beams, whose origins turn with the rotor.
+        The beams' origins rotate with the rotor.
         """
         encoder = 2 * np.pi * (1 - column / self.n_columns)[:, None]
         azimuth = encoder - self.azimuth_rad

@@ -82,7 +82,7 @@ class PositionPacket(NamedTuple):
         us: time past the hour on the sensor's counter.
         pps: index into velodyne.PPS_STATES.
         nmea_s: second past the hour in the last sentence received; None without a valid $GPRMC.
-        is_fix: whether that sentence claims to be valid (status A).
+        is_fix: whether that sentence is marked valid (status A).
     """
 
     us: int
@@ -105,7 +105,7 @@ def read_data_packet(
         wanted: the model whose packets are read.
 
     Raises:
-        BadPacketError: it is not a data packet of that model.
+        BadPacketError: not a data packet of that model.
     """
     if len(payload) != velodyne.DATA_BYTES:
         raise BadPacketError(f"{len(payload)} bytes")
@@ -147,7 +147,7 @@ def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
     """Decode a position packet, the sensor's report on its clock.
 
     Raises:
-        BadPacketError: it is not a position packet.
+        BadPacketError: not a position packet.
     """
     if len(payload) != velodyne.POSITION_BYTES:
         raise BadPacketError(f"{len(payload)} bytes")
@@ -209,8 +209,8 @@ class VelodyneClock:
         """Record an arrival.
 
         Args:
-            packet: in its place.
-            elapsed_ns: reading of the counter since any fixed moment.
+            packet: packet in order.
+            elapsed_ns: reading of the counter since any fixed time.
         """
         self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
         if not packet.host_ns:
@@ -254,8 +254,8 @@ class VelodyneClock:
     def _state(self) -> Kind:
         """Find the first reason against using the sensor's time.
 
-        It is trusted if the clock is locked to pulses, the NMEA sentence matches the second of the counter,
-        and the host's clock agrees.
+        The sensor's clock is trusted if it is locked to pulses, the NMEA sentence matches the second of the
+        counter, and the host's clock agrees.
         """
         position, ahead_ns = self.position, self.ahead_ns()
         if not self._is_device_wanted:

@@ -3,7 +3,7 @@
 velodyne-decoder computes the points. Two of its choices matter: it adds the vertical offsets of the lasers
 (up to 11 mm, which ROS 1 drivers omit), and between two azimuths takes the rotor's mean speed over the
 packet, where drivers interpolate block by block (up to 0.025 deg apart). Its StreamDecoder is not used: it
-cuts revolutions at packets, hands on partial ones, and keeps both returns of a firing.
+cuts revolutions at packets, returns partial ones, and keeps both returns of a firing.
 """
 
 import math
@@ -194,7 +194,7 @@ class Vlp16Stream:
         """Compare the sensor's counter with the host's clock since the previous packet.
 
         Returns:
-            "late" for a packet to skip: it was sent before another that has arrived, or twice;
+            "late" for a packet to skip, which was sent before an arrived one, or twice;
             "after a step" if the sensor's clock (as when it locks to a pulse) or its return mode was set.
         """
         last, self._last = self._last, packet
@@ -304,8 +304,8 @@ class Vlp16Stream:
 def keep_brighter(packets: NDArray[np.void]) -> None:
     """Blank the weaker of two returns in dual-mode packets (P,), or the last of two equal ones.
 
-    At the board's rim, board and wall may both answer one pulse; the sensor reports the brighter answer in
-    its strongest mode.
+    At the board's border, board and wall may both return one pulse; in its strongest mode, the sensor reports
+    the brighter return.
     """
     returns = packets["blocks"]["returns"]
     last, strongest = returns[:, 0::2], returns[:, 1::2]

@@ -87,7 +87,7 @@ class _Solved:
         refused: why captures without the board in both sensors are unusable.
         estimate: estimate of the extrinsics.
         validation: validation of the estimate on the camera's own captures and images.
-        lacking: why channels of the camera are not part of it.
+        lacking: reasons why channels of the camera are not included.
         together: the joint estimate that includes it; None if it was estimated separately.
     """
 
@@ -166,12 +166,12 @@ def calibrate_session(
     Nothing is written.
 
     Args:
-        session: its folder, or one that is open for reading.
+        session: folder of the session, or a session open for reading.
         detections: detections of the session; None to run `detect_boards` with its defaults.
         options: options of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
-        channels: the cameras' channels to use; None for all that the session holds.
-        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        channels: the cameras' channels to use; None for all in the session.
+        reference: extrinsics to report errors against; neither estimate nor verdict uses them.
         progress: called with (done, total) for each camera and LiDAR in turn.
         thumbnails: images from `detect_boards`, for the report; missing ones are decoded again.
 
@@ -321,7 +321,7 @@ def _without_disagreeing(shortages: Sequence[Finding]) -> list[Finding]:
 def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:
     """List LiDARs without captures, and groups of sensors not connected with the first one's by placements.
 
-    The placement that would connect them is one before the two sensors that share the most captures already.
+    A placement seen by the two sensors that already share the most captures would connect them.
     """
     absent = [LIDAR_ABSENT(name) for name in rig.lidars if name not in detections.lidars]
     held: dict[str, set[str]] = {name: set(found) for name, found in detections.lidars.items()}

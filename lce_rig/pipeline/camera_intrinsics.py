@@ -64,9 +64,9 @@ class MeasuredIntrinsics:
         estimate: the intrinsics from the boards.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
         certainty: uncertainty of the estimate, per pixel.
-        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
+        judgement: whether the captures determine the intrinsics better than the profile, see `judge_lens`; or
             another lens model that fits them.
-        misfit: how the profile's do not fit; None if they do, or are for another resolution.
+        misfit: misfit of the profile's intrinsics; None if they fit, or are for another resolution.
         weaknesses: directions that the captures do not determine, with advice.
         refused: name of an image -> why the estimate does not use it.
     """
@@ -247,7 +247,7 @@ def _fit(
     """Fit intrinsics to the boards.
 
     Raises:
-        NotEnoughDataError: too few captures show one; the most frequent causes are named.
+        NotEnoughDataError: too few captures show a board; the most frequent causes are named.
     """
     n_needed = rig.quality.min_captures
     if _n_captures(found) < n_needed:
@@ -275,7 +275,7 @@ def _fit(
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step: one camera_info file per camera.
 
-    Other files there stay, as those of cameras that an earlier run measured.
+    Other files stay, such as those of cameras from an earlier run.
 
     Returns:
         The files of this run.

@@ -105,7 +105,7 @@ def _session_names(paths: Sequence[Path]) -> list[str]:
     """Name sessions by their folder, or by their path if two folders have the same name.
 
     Raises:
-        UsageError: one is given twice.
+        UsageError: a session is given twice.
     """
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):

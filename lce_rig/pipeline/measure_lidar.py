@@ -47,7 +47,7 @@ def measure_lidar(
     Args:
         sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
         lidar: the LiDAR's name in the profiles; None for the only one.
-        found: detections of each session; None detects the board first.
+        found: detections of each session; None to detect the board first.
         progress: called with (done, total) while a session is read.
 
     Raises:

@@ -97,13 +97,13 @@ def new_profile(
         lidar_model: maker's name of the LiDAR's model; None if unknown.
         cameras: names of the cameras, in the order of a bag's topics.
         intrinsics: one per camera, in the same order, or one file for all; empty to read the bag's.
-        source: name of the text in errors.
+        source: name of the profile in errors.
 
     Returns:
         The text; and a line for each value found or chosen.
 
     Raises:
-        UsageError: a camera without intrinsics, or names or intrinsics of cameras that are not there.
+        UsageError: a camera without intrinsics, or names or intrinsics of missing cameras.
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
@@ -184,7 +184,7 @@ def _survey(recording: Path | None, skipped: list[str]) -> tuple[list[SensorTopi
     """List the topics of a bag, or the images and point clouds of a folder; also the skipped topics.
 
     Raises:
-        SourceError: nothing is there that describes a rig's sensors.
+        SourceError: the path has no description of a rig's sensors.
     """
     if recording is None:
         return [], [], []
@@ -213,7 +213,7 @@ def _lidar(
         name: name of the LiDAR.
         model: name of its model, as given.
         notes: receives differences between the rings of cloud and model.
-        topic: that the cloud is from; None without a bag.
+        topic: topic of the cloud; None without a bag.
         cloud: one scan; None without one.
         where: file or topic, for messages.
     """

@@ -1,7 +1,7 @@
 """Two sensors of one kind that saw the same boards: their captures, and the verdict on their pose.
 
 In a result T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired
-where one of them has no LiDAR; where both have one, its result relates them.
+if one of them has no LiDAR; if both have one, its result relates them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -98,8 +98,8 @@ def solve_peers(
         rig: the profile.
         detections: detections of the session.
         pairs: pairs of two LiDARs or two cameras.
-        options: options of the estimate; the method is always of maximum likelihood.
-        lenses: lenses of cameras that have one already.
+        options: options of the estimate; the method is always maximum likelihood.
+        lenses: lenses of cameras that were already fitted.
         progress: called with each pair.
 
     Returns:

@@ -31,8 +31,8 @@ class WrittenResult(NamedTuple):
 
     Attributes:
         files: result.json and the exports.
-        findings: content that exports leave out or change.
-        report: the page; None if it was not asked for.
+        findings: content that exports omit or change.
+        report: the page; None if not requested.
         previous: the folder with the earlier run's files; None if there was none.
     """
 
@@ -54,7 +54,7 @@ class Result:
     Attributes:
         session: the source of the captures.
         pairs: one for each calibrated camera and LiDAR.
-        shortages: for each other camera and LiDAR with captures, why it has no result.
+        shortages: reason why each other camera and LiDAR with captures has no result.
         thumbnails: images that were decoded for the result; the report decodes the others.
     """
 
@@ -67,7 +67,7 @@ class Result:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
 
         Raises:
-            NotEnoughDataError: they have no result.
+            NotEnoughDataError: the sensors have no result.
         """
         for pair in self.pairs:
             if pair.camera == camera and lidar in (None, pair.lidar):
@@ -180,7 +180,7 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
         is_new: whether it is to be written.
 
     Raises:
-        UsageError: a name that no result, or no new one, can have.
+        UsageError: the name is not valid for a result, or for a new one.
     """
     if is_new and name is not None and (name == CURRENT or name.rpartition("/")[2] == PREVIOUS):
         raise UsageError(f"a new result cannot be named {name!r}", "Choose another name.")

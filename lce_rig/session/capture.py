@@ -174,7 +174,7 @@ class Capture:
         """Read an image exactly as it was captured.
 
         Raises:
-            SessionError: there is none, or it is damaged.
+            SessionError: the image is missing or damaged.
         """
         import cv2
 
@@ -187,7 +187,7 @@ class Capture:
         """Read a scan exactly as it was captured.
 
         Raises:
-            SessionError: there is none, or it is damaged.
+            SessionError: the scan is missing or damaged.
         """
         entry, data = self._load(f"scan of {lidar}")
         with self._reading(entry.file):
@@ -206,7 +206,7 @@ class Capture:
         """Read the events around this capture exactly as recorded, timestamps to the microsecond.
 
         Raises:
-            SessionError: there are none, or they are damaged.
+            SessionError: the events are missing or damaged.
         """
         entry, data = self._load(f"events of {camera}")
         with self._reading(entry.file):
@@ -216,7 +216,7 @@ class Capture:
         """Read every file once.
 
         Raises:
-            SessionError: the first thing found wrong.
+            SessionError: the first fault found.
         """
         for entry in self._manifest.files:
             self._read(entry)
@@ -260,7 +260,7 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
     """Check that samples can be one capture of a rig.
 
     Raises:
-        SessionError: there are none, two of one sensor, one of a sensor that the rig lacks, or events of
+        SessionError: there are no samples, two of one sensor, one of a sensor not in the rig, or events of
             another resolution than the camera's.
     """
     sources = [f"image of {i.sensor}.{i.channel}" for i in images]

@@ -155,7 +155,7 @@ def _rays_beyond_the_lens(intrinsics: Intrinsics, pixels: Array) -> Array:
 def lens_reach(intrinsics: Intrinsics) -> float:
     """Find the |(pixel - c) / f| up to which images follow the lens model.
 
-    Just before it folds, the polynomial's slope falls to zero: images leave it a little earlier.
+    The polynomial's slope falls to zero just before it folds: images end a little earlier.
     """
     widest = 0.999 * intrinsics.max_radius
     if intrinsics.model == "equidistant":

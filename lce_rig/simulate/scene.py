@@ -195,7 +195,7 @@ class Scene:
 
     def cast_board(self, origins: Array, directions: Array) -> Hits:
         """Intersect rays with the board's rectangle: p_z + s u_z = 0 in frame board."""
-        # One axis at a time: thrice as fast as a product with the whole rotation.
+        # One axis at a time: three times as fast as a product with the whole rotation.
         axes, centre = self.T_world_board[:3, :3].T, self.T_world_board[:3, 3]
         start_x, start_y, start_z = ((origins - centre) @ axis for axis in axes)
         step_x, step_y, step_z = (directions @ axis for axis in axes)

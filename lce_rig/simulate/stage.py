@@ -105,9 +105,9 @@ def truth_extrinsics(
 ) -> dict[tuple[str, str], Array]:
     """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR, and of every two LiDARs.
 
-    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that no
-    solver can pass by returning the nominal. Pairs without an entry follow from the others; a camera without
-    any looks along the first LiDAR's x axis.
+    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that a
+    solver cannot pass by returning the nominal ones. Pairs without an entry follow from the others; a camera
+    without any looks along the first LiDAR's x axis.
 
     Args:
         rig: the profile.
@@ -241,7 +241,7 @@ def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]
 
     Returns:
         `pairs` of camera, or another LiDAR, and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's
-        alone, and how much more the timestamps of images and events read than the rig's clock, which is the
+        alone, and the excess of the timestamps of images and events over the rig's clock, which is the
         LiDAR's.
     """
     pairs = [

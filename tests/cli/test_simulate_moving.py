@@ -120,7 +120,7 @@ def recorded(tmp_path_factory):
     return folder / "r"
 
 
-def test_a_recording_is_read_by_the_readers_of_recordings(recorded, rig):
+def test_simulated_recording_is_readable(recorded, rig):
     assert sorted(path.name for path in recorded.iterdir()) == ["recording.bag", "truth.json"]
     recording = open_recording(recorded / "recording.bag", rig)
     samples = list(recording.samples())

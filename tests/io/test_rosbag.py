@@ -209,7 +209,7 @@ def test_bag_clock_set_back_restarts_order(tmp_path, rig, write_bag, stream):
     assert has_note(recording.notes, CAM, "1 jumps", "clock back")
 
 
-def test_messages_without_stamps_take_the_time_of_receipt(
+def test_messages_without_timestamps_use_time_of_receipt(
     tmp_path, rig, room, picture, write_bag, cloud_message, image_message
 ):
     messages = [

@@ -65,7 +65,7 @@ def certify(Q: Array, R: Array) -> Certificates:
 
     Args:
         Q: (B, 10, 10).
-        R: (B, 3, 3) candidates, as `minimise_on_so3` gives them.
+        R: (B, 3, 3) candidates from `minimise_on_so3`.
     """
     cost = rotation_cost(Q, R)
     tolerance = _RELATIVE_GAP * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
@@ -195,7 +195,7 @@ def _raise_least_eigenvalue(Z: Array) -> Array:
     """Maximise s subject to Z + sum c_j N_j >= s I by Newton's method on s + mu log det(. - s I), mu -> 0.
 
     Returns:
-        (B,) the largest least eigenvalue of Z + sum c_j N_j that was met.
+        (B,) the largest least eigenvalue of Z + sum c_j N_j that was found.
     """
     family = _dual().family
     m = len(family)

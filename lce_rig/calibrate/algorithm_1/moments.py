@@ -108,7 +108,7 @@ class Problem:
             x: (B, 14).
 
         Returns:
-            (B, n), as `Board.nearest_edge`.
+            (B, n) edges, numbered as in `Board.nearest_edge`.
         """
         return self._board.nearest_edge(self._on_board(x))
 

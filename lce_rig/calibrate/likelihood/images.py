@@ -72,10 +72,10 @@ def stack_images(
     """Stack the images of one camera.
 
     Args:
-        capture: (P,) which of the stacked captures they belong to.
-        images: P of them, or poses by the first of two LiDARs, which have no lens.
+        capture: (P,) index of each one's stacked capture.
+        images: P boards in images; or poses by the first of two LiDARs, without a lens.
         pattern_offset_m: standard deviation of the pattern's centre from the plate's.
-        lens: whose errors are unknowns; None for a lens that is exact.
+        lens: lens whose errors are unknowns; None for an exact lens.
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])

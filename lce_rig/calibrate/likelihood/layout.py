@@ -163,7 +163,7 @@ class State:
     """Values of all unknowns.
 
     Attributes:
-        layout: their places.
+        layout: places of the unknowns.
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
         own_shift_m: (F,) shift of each capture's ring ends beyond that of all, like `SHIFTS`' d_0.

@@ -107,7 +107,7 @@ class Priors:
         stretch: relative error of ranges; held.
         contrast_m: difference of ranges between dark and white parts of the pattern; held.
         beam: relative error of the beam's width and of its height, without rings.
-        known: the LiDAR's errors as measured before: means and standard deviations of lasers and lens.
+        known: the LiDAR's errors measured before: means and standard deviations of lasers and lens.
         squares: relative error of the squares' size.
         pattern_m: error of the pattern's place on the plate, to the right and up; held.
         optics: errors of each lens, in directions of unit variance; held.

@@ -21,7 +21,7 @@ s + g d lies anywhere between 0 and D. The error
     e = s + g d - D / 2                                                                                  (2)
 
 in units of D has the density of `likelihood.end_density`. A beam that meets board and background reports the
-stronger echo: with q the share of the power that would come from the background if the beam met both alike,
+stronger echo: with q the fraction of the power from the background if the beam hit both equally,
 and r the range,
 
     d = d_0 + c r + d_1 q    where the background is far behind
@@ -228,8 +228,8 @@ def displacements(points: Array, T_lidar_board: Array, board: Board) -> Array:
     by_bow = -R[:, :, 2, None] * bow_heights(on_board, board)[:, None]
     side = np.where(is_dark(board, on_board[:, :2]), 0.5, -0.5)
     by_print = -(side / np.linalg.norm(points, axis=1))[:, None] * points
-    # The stretch moves points along their rays by shares of the model's ranges (`sum_ranges`): those measured
-    # have noise, which it would explain.
+    # The stretch moves points along their rays by fractions of the model's ranges (`sum_ranges`): measured
+    # ranges have noise, which the stretch would absorb.
     none = np.zeros((len(points), 3, 1))
     return np.concatenate([lens_fields(points), by_bow, none, by_print[..., None]], axis=2)
 
@@ -293,7 +293,7 @@ class RangeSums(NamedTuple):
 
     Attributes:
         sums: (F, L, 16, 16) in columns of `RING`, weighted by capture.
-        n_returns: (F, L) how many.
+        n_returns: (F, L) number of returns.
     """
 
     sums: Array
@@ -355,7 +355,7 @@ class EdgeRows:
         group: (M,) index of each end's pair of capture and ring, of F L in all; ascending.
         rows: (M, 28) in columns of `END`, e in m.
         step_m: (M,) D.
-        range_m: (M,) to the board.
+        range_m: (M,) range to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
         sigma_m: (M,) noise beyond that of a sharp border.
     """

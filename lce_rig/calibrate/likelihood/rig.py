@@ -6,7 +6,7 @@ T, the board's pose T_m T in the LiDAR's frame has the tangent
 
     B x + R y,    R the rotation of T_m, B = [I, -(R t)^; 0, I]                                          (1)
 
-The LiDARs share the shape of the plate; constant errors of lasers, lens and ring ends are each one's own.
+The LiDARs share the shape of the plate; each has its own constant errors of lasers, lens and ring ends.
 Loops of poses close, as each sensor has one.
 """
 
@@ -217,7 +217,7 @@ class RigEstimate(Optimum):
     def lidar(self, m: int) -> tuple[Array, Array]:
         """Pose of the base in a LiDAR's frame: T_lidar_base (4, 4) as reported, and its derivative by z.
 
-        Both apply to points as the drivers give them, which lie beside the true ones by the lens.
+        Both apply to points from the drivers, which the lens displaces from the true ones.
         """
         J = np.zeros((6, self.terms.size))
         T = self.terms.T_lidar_base[m]

@@ -152,7 +152,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     Args:
         samples: samples of F captures.
         offset_s: (C,) added to the images' times, by channel.
-        only: a channel that alone gives the board's position; the others then only give its motion.
+        only: channel that alone determines the board's position; the others then only determine its motion.
 
     References:
         The typical rates follow from expectation maximisation: Dempster, Laird, Rubin, "Maximum likelihood

@@ -368,7 +368,7 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
     """Explain why the board is not detected.
 
     Args:
-        detection: a sensor of the guide does not see the board in it, or not well enough.
+        detection: detection in which a sensor of the guide does not see the board well enough.
         guide: the guide of these sensors.
         reasons: the last refusal of each stream, by its name.
     """

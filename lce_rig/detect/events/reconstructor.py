@@ -150,9 +150,9 @@ class _Window:
 class Reconstructor:
     """Runs the network over one event stream, with a recurrent state for the whole stream.
 
-    Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
-    asked for change the network's state: an image at a timestamp is a side step from the running state with
-    the events up to the timestamp.
+    Windows depend on the events alone, so that neither the batches in which events arrive nor the requested
+    timestamps change the network's state: an image at a timestamp is an extra step from the running state
+    with the events up to the timestamp.
 
     Args:
         channel: the channel of the images.
@@ -208,7 +208,7 @@ class Reconstructor:
         """Add the next events of the stream; `picture_at` returns its images.
 
         Args:
-            events: up to the next timestamp that an image will be asked for, or shorter.
+            events: events up to the next requested timestamp at most.
 
         Raises:
             SourceError: the events are of another sensor or go back in time.

@@ -69,9 +69,9 @@ def find_event_board(
     """Reconstruct an image at a timestamp, find the board and track it backwards and forwards.
 
     Args:
-        events: from long enough before the timestamp for the network to settle.
-        stamp_ns: on the events' clock.
-        reconstructor: is reset.
+        events: events, from long enough before the timestamp for the network to settle.
+        stamp_ns: the timestamp, on the events' clock.
+        reconstructor: the reconstructor, which is reset first.
         board: the board as the profile describes it.
         intrinsics: intrinsics of the camera.
         limits: `quality` of the rig profile.
@@ -79,7 +79,7 @@ def find_event_board(
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
 
     Returns:
-        The image at that time, and the board in it with its track in those about it; or why there are none.
+        The image at that time, and the board in it with its track in the images around it; or the refusals.
 
     Raises:
         ProfileError: the intrinsics are for images of another size.

@@ -72,8 +72,8 @@ def _shortest_side_px(grid_px: Array) -> float:
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     """Check whether the grid of corners covers the whole pattern.
 
-    One row of squares surrounds the outermost corners. It must alternate like the inner squares, and the
-    next row outwards must not.
+    The row of squares around the outermost corners must alternate like the inner squares; the next row
+    outwards must not.
 
     Args:
         grey: (H, W) the image.

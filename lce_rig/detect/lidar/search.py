@@ -32,7 +32,7 @@ from lce_rig.detect.lidar.template import (
 
 # Fraction of returns beyond the outline, in the board's plane, above which something touches the board.
 TOUCHING_SHARE = 0.10
-SCATTER_M = 0.02  # scatter added to the LiDAR's noise in the search for plates to name
+SCATTER_M = 0.02  # added to the LiDAR's noise in the search for plates to report
 # Maximum sum of |log| of the ratios of long and short side for a plate to be reported.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
@@ -71,8 +71,8 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
     """Refuse a board whose returns scatter more about its plane than the LiDAR's noise explains.
 
     Args:
-        heights_m: (N,) of the returns over the plane.
-        limit_m: largest rms of them.
+        heights_m: (N,) distances of the returns from the plane.
+        limit_m: largest rms distance.
     """
     return LIDAR_TOO_THICK.refusal(plane_rms_m=float(np.sqrt(np.mean(heights_m**2))), max_plane_rms_m=limit_m)
 
@@ -263,7 +263,7 @@ def _past_dark_squares(
 ) -> tuple[PlaneView, Placement] | None:
     """Register the outline of a board whose dark squares, at grazing incidence, return nothing or too far.
 
-    Such beams do not locate the outline; the others must fit it as without noise. Of boards at 42 to
+    Such beams do not locate the outline; the others must fit it as if there were no noise. Of boards at 42 to
     66 deg before a VLP-16 and a VLP-32C, 12 to 41 % of the beams are lost; of walls and tables at most 9 %.
 
     Args:
@@ -271,7 +271,7 @@ def _past_dark_squares(
         board, start, limits, max_beyond: see `measure_plate`.
 
     Returns:
-        As `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.
+        See `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.
     """
     plane, centre, _ = start
     if plane[3] > np.cos(GRAZING_RAD) * np.linalg.norm(centre):

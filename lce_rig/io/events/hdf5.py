@@ -160,7 +160,7 @@ def _column(file: Any, name: str) -> Any:
     """Find a list of numbers.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: there is no column of this name.
     """
     column = _find(file, name)
     if getattr(column, "ndim", 0) != 1 or column.dtype.kind not in "biuf":

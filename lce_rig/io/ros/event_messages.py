@@ -87,7 +87,7 @@ class PacketDecoder:
         """Decode a packet.
 
         Raises:
-            ValueError: its encoding is not supported.
+            ValueError: the encoding is not supported.
         """
         events, base_ns = NO_EVENTS, 0
         if packet.encoding == "evt3":

@@ -53,7 +53,7 @@ def draw_debug(
         lidar_result: candidates, best first, or why the scan was refused.
         board: the board.
         intrinsics: the camera.
-        title: one line above.
+        title: one line above the drawing.
         chosen: index of the candidate used, which is drawn face on.
         mismatch: if the sensors disagree, why no candidate matches the board in the image; the best candidate
             is drawn face on in another colour.

@@ -102,12 +102,12 @@ class Preview:
 
     Attributes:
         urls: the links, the likeliest first; empty before `start`.
-        failure: that ended the page; "" for none. The collection continues without it.
+        failure: failure that ended the page; "" for none. The collection continues without it.
 
     Args:
         address: host name or IPv4 address to bind to; "0.0.0.0" for all networks.
-        port: 0 for any free one.
-        token: that a browser must bring; None draws one.
+        port: port number; 0 for any free one.
+        token: token that a browser must send; None for a random one.
     """
 
     def __init__(self, address: str = LOOPBACK, port: int = DEFAULT_PORT, token: str | None = None) -> None:

@@ -49,10 +49,10 @@ def report_page(
     """Write the report of a result as one HTML file: the same result gives the same bytes.
 
     Args:
-        session: whose result it is.
+        session: session of the result.
         file: the result.
         overlays: the folder of overlays beside the report, which shows them once they are drawn.
-        thumbnails: thumbnails of the session, if some are known; the page is the same without.
+        thumbnails: available thumbnails of the session; the page is the same without them.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
     origin, folder = file.provenance, session.path.resolve().name
@@ -303,7 +303,7 @@ def worst_first(planes_m: Sequence[float], edges_m: Sequence[float]) -> list[tup
     """Order captures by their residuals, the largest first.
 
     Returns:
-        The index of each, and how many times the median its planes or edges lie apart.
+        The index of each, and the ratio of its plane or edge residuals to the median.
     """
     ratios = np.zeros(len(planes_m))
     for values in (np.nan_to_num(np.array(planes_m)), np.nan_to_num(np.array(edges_m))):

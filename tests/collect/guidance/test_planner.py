@@ -35,7 +35,7 @@ def test_guide_asks_for_named_distances(profile, camera):
     assert max(NEAREST_M, limits.min_distance_m) <= near_m < 1.3
     assert near_m < far_m <= limits.max_distance_m
     guide = (Path(__file__).parents[3] / "docs" / "collect.md").read_text()
-    assert f"distance from {NEAREST_M:g} m" in guide
+    assert f"Distances from {NEAREST_M:g} m" in guide
     assert re.search(rf"{far_m:.1f} m [^.]*`{profile}`", guide)
 
 

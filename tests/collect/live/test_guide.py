@@ -57,7 +57,7 @@ def test_guide_two_lidars_counts_placements():
     assert not guide.is_enough
 
 
-def test_a_capture_that_is_taken_back_is_forgotten(guide):
+def test_rejected_capture_frees_its_placement(guide):
     for k in range(3):
         guide.plan(None, float(k))
         last = guide.wanted
