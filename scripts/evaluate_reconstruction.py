@@ -50,7 +50,7 @@ class BoardScene:
 
 
 def corner_error_px(grey: np.ndarray, truth_px: np.ndarray) -> float | None:
-    """Find the board and give the rms distance of its corners from the truth; None where it is not found."""
+    """Detect the board and return the rms error of its corners; None if it is not detected."""
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(grey, (COLS - 1, ROWS - 1), flags=flags)
     if not found:

@@ -32,7 +32,7 @@ SAVE_EVERY_S = 60.0
 
 @dataclass
 class Progress:
-    """What a checkpoint must know to go on: where the run is and what it has cost."""
+    """State of a run in a checkpoint: progress and cost."""
 
     scene: int = 0
     updates: int = 0

@@ -57,7 +57,7 @@ assert len(ADVISED) > 20
 
 
 def _lacking(command):
-    """Say what a command lacks to be run as it is typed; "" if nothing."""
+    """Return the reason why a command cannot be run as typed; "" if it can."""
     words = [word for word in shlex.split(command) if word != "\\"]
     at = cli
     context = click.Context(cli, info_name="lce-rig")

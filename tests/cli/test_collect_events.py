@@ -1,4 +1,4 @@
-"""`lce-rig collect` from recordings with raw events: what it captures, and what it says where it cannot."""
+"""`lce-rig collect` from recordings with raw events: captures, and messages without any."""
 
 from dataclasses import replace
 

@@ -90,7 +90,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig, tmp_path):
     assert (capture.image_keys, capture.event_cameras) == ([], ["davis"])
     outcome = lce_rig(*words, tmp_path / "t", "--motion", "still")
     assert outcome.code == 3
-    assert "only frames" in outcome.err and not any((tmp_path / "t").glob("captures/*"))
+    assert "Only frames" in outcome.err and not any((tmp_path / "t").glob("captures/*"))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""PCD files: exact there and back, as any writer makes them; damaged ones say what is wrong with them."""
+"""PCD files: exact round trips, files of other writers; errors of damaged files name the fault."""
 
 import struct
 from contextlib import suppress

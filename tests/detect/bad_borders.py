@@ -1,4 +1,4 @@
-"""Boards whose border is not seen whole: hidden, smeared, or merged with what they stand on."""
+"""Boards with an incomplete border: hidden, smeared, or merged with their stand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

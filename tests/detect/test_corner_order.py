@@ -1,4 +1,4 @@
-"""Of the poses that an image of a board admits, the one nearest to another image's is taken."""
+"""Choice of the pose nearest to another image's, among those that fit an image of a board."""
 
 import numpy as np
 import pytest

@@ -87,7 +87,7 @@ def test_events_are_counted_on_the_board_only(stream, detection):
     quality = detection[1].events
     on_board = (BOARD.width_m * BOARD.height_m) * (FOCAL_PX / DEPTH_M) ** 2
     recent = stream.between(STAMP - 100 * MS, STAMP)
-    # Nothing but the board makes events here, less 0.3 noise events a second and pixel.
+    # Only the board generates events here, apart from 0.3 noise events per second and pixel.
     assert quality.events_px_s * on_board == pytest.approx(len(recent) / 0.1, rel=0.1)
     assert quality.events_px > 3
 

@@ -165,7 +165,7 @@ def test_image_board_cut_by_border_is_reported():
     pixels = draw(SYMMETRIC, shifted, looking(5, 0, 5, (0.0, 0.0, 1.8)))
     refusal = refused(pixels, SYMMETRIC, shifted)
     assert (refusal.code, refusal.figures["side"]) == ("image.cut_off", "right")
-    # A part of a pattern says nothing about the number of its corners.
+    # A part of a pattern does not determine the number of its corners.
     assert "n_cols_seen" not in refusal.figures
 
 

@@ -1,4 +1,4 @@
-"""Lines of sync boards, sound and damaged, and what a board's messages add up to."""
+"""Intact and damaged lines of sync boards, and the state derived from their messages."""
 
 import re
 from functools import reduce

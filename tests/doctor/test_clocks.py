@@ -15,7 +15,7 @@ from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, lo
 
 
 def with_utc(board):
-    """The board knows UTC, which the computer has exactly."""
+    """The board has UTC, equal to the computer's."""
     assert board.host_clock is not None
     return replace(board, utc_clock=board.host_clock)
 

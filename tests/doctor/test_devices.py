@@ -1,4 +1,4 @@
-"""The computer, devices and their streams: what is absent, slow, lost or stopped has a line that says so."""
+"""The computer, devices and their streams: a line for each that is absent, slow, lost or stopped."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Sessions and recordings below a root, and what a manifest says of them."""
+"""Sessions and recordings below a root, and their entries in a manifest."""
 
 import pytest
 

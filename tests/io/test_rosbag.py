@@ -1,4 +1,4 @@
-"""Bags of all three kinds, with whatever layouts, topics, stamps and damage they come."""
+"""Bags of all three kinds, with various layouts, topics, timestamps and damage."""
 
 import os
 import shutil

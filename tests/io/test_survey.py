@@ -1,4 +1,4 @@
-"""A bag tells what a profile has to say of its sensors."""
+"""Sensors of a profile from a bag."""
 
 import numpy as np
 import pytest

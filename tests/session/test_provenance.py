@@ -1,4 +1,4 @@
-"""Where results come from: robot, serial numbers, date, and a fingerprint that only inputs change."""
+"""Provenance of results: robot, serial numbers, date, and a fingerprint that depends on inputs only."""
 
 import shutil
 from collections.abc import Callable

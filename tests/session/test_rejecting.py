@@ -1,4 +1,4 @@
-"""Rejected captures are out of use, not lost, and come back as they were."""
+"""Rejected captures are not used, but kept, and restored unchanged."""
 
 import pytest
 

@@ -14,7 +14,7 @@ NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m
 
 
 def sooner(capture, by_m, echo, behind_m):
-    """Move ring ends of one capture inwards by (M,), and tell what is behind them."""
+    """Move ring ends of one capture inwards by (M,), and set their background."""
     lidar = capture.lidar
     axis = lidar.T_lidar_board[:3, :2]
     local = (lidar.edge_points - lidar.T_lidar_board[:3, 3]) @ axis
@@ -106,7 +106,7 @@ def test_residuals_use_shifted_ring_ends():
 
 
 def test_background_person_behind_few_boards_is_ignored():
-    # One capture says nothing of how captures scatter, and two hardly tell two effects from chance.
+    # One capture has no scatter, and two hardly distinguish two effects from chance.
     rng = np.random.default_rng(2)
     for n_held in (1, 2, 3):
         boards = enumerate(simulate(6, 9))

@@ -32,7 +32,7 @@ def without_errors(scans, T_lidar_board):
 
 
 def off(state, name, index, value):
-    """Give one constant error a value."""
+    """Set one constant error."""
     z = state.z.copy()
     z[state.layout.z[name]][index] = value
     return replace(state, z=z)

@@ -1,4 +1,4 @@
-"""A collection on sensors that send over UDP and pipes: what it holds, how it ends, and its recordings."""
+"""Collection from sensors that send over UDP and pipes: captures, end, and recordings."""
 
 import random
 import signal

@@ -1,4 +1,4 @@
-"""Events come back event for event as cameras encode them; in bags, lost and broken packets are counted."""
+"""Round trips of events in the cameras' encodings; lost and broken packets in bags are counted."""
 
 import numpy as np
 import pytest
