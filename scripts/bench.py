@@ -110,7 +110,7 @@ def main() -> None:
 
 
 def _command(words: list[str]) -> str:
-    """Return the command as anyone may type it, without folders of this computer."""
+    """Return the command as typed, without folders of this computer."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--record", action="store_true")
     parser.add_argument("-o", "--output")

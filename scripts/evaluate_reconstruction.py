@@ -24,11 +24,11 @@ SIZE_PX = 192
 N_WARM_UP = 12
 COLS, ROWS = 7, 6  # squares
 MARGIN_PX = 6.0
-WRONG_GRID_PX = 5.0  # beyond, the finder took other corners than the board's
+WRONG_GRID_PX = 5.0  # beyond, the finder detected corners that are not the board's
 
 
 class BoardScene:
-    """One moving checkerboard and where its inner corners truly are."""
+    """One moving checkerboard and the true positions of its inner corners."""
 
     def __init__(self, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)

@@ -108,7 +108,7 @@ class Trainer:
                 mean.lerp_(value, 1 - decay)
 
     def save(self, folder: Path) -> None:
-        """Write checkpoint.pt and reconstruction.onnx; each is whole at any moment."""
+        """Write checkpoint.pt and reconstruction.onnx; each is complete at any time."""
         state = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),

@@ -86,7 +86,7 @@ class CaptureFeatures:
         """Write the board coordinates of points (N, 3) of the LiDAR as rows that multiply [vec R; t; d; 1].
 
         Returns:
-            (N, 3, 14), without the edge shift.
+            (N, 3, 14); the edge shift is not included, its column is zero.
         """
         T_board_cam = invert(self.T_cam_board)
         R = T_board_cam[:3, :3]

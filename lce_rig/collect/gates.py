@@ -5,8 +5,7 @@ Events need motion, the LiDAR needs stillness. A detection is usable if, in an e
 - is not faster than `quality.max_board_speed_mps`,
 - generated at least `quality.min_events_px` events per pixel in the second before,
 - and moves at 3 cm/s or more, or generated plenty of events nevertheless: it has just stopped, or the rig
-moves.
-  Events of flickering light do not count.
+  moves. Events of flickering light do not count.
 
 Among such moments within seconds of each other and at one placement, the one with complete events and the
 steadiest speed nearest to 10 cm/s is chosen.

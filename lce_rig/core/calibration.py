@@ -45,7 +45,7 @@ def _array(rows: Any) -> Array:
 
 
 def _pose(rows: Any) -> Array:
-    parse_pose(rows)  # only a check: its result is rounded
+    parse_pose(rows)  # only a check: the digits of the file are kept
     return _array(rows)
 
 

@@ -74,7 +74,7 @@ def draw_checkerboard(
     is_light = (torch.floor(u) + torch.floor(v)) % 2 == 0
     is_pattern = (u >= 0) & (u < cols) & (v >= 0) & (v < rows)
     margin = _uniform(generator, 0.0, 1.2)
-    # Boards are mostly white around the print; some are mounted on dark or grey plates.
+    # Boards are mostly white around the pattern; some are mounted on dark or grey plates.
     ground = light if _uniform(generator, 0, 1) < 0.75 else _uniform(generator, 0.05, 0.7)
     texture = torch.where(is_pattern & ~is_light, torch.tensor(dark), torch.tensor(light))
     texture = torch.where(is_pattern, texture, torch.tensor(ground))

@@ -117,7 +117,7 @@ def scan_board(T_lidar_board, rng, scenario, board, bias_m=0.0):
     )
     ranges = (R[:, 2] @ centre) / (rays @ R[:, 2])
     on_board = (rays * ranges[..., None] - centre) @ R
-    # A beam so wide meets the board from that far beyond an edge, farther along a board seen obliquely.
+    # A beam of this width still hits the board this far beyond an edge, farther along a board seen obliquely.
     wide = scenario.footprint_m * np.hypot(1, (rays @ R)[..., :2] / (rays @ R)[..., 2:])
     half = np.array([board.width_m, board.height_m]) / 2 + wide
     if scenario.end_sigma_m > 0:
@@ -182,7 +182,7 @@ def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
 
 
 def with_decoy(item, decoy, *, is_first):
-    """Add a rival to the LiDAR's candidates."""
+    """Add a decoy to the LiDAR's candidates."""
     places = (decoy, *item.places) if is_first else (*item.places, decoy)
     return replace(item, surface=places[0], others=places[1:])
 

@@ -137,7 +137,7 @@ _PLACEHOLDER = re.compile("X|R|RIG|FILE|FOLDER|NAME|TARGET|ROOT|SESSION|OTHER_SE
 
 
 def _typed(command):
-    """Put names of the workbench where an advised command has placeholders."""
+    """Replace the placeholders of an advised command by test values."""
     words = shlex.split(command)
     first = " ".join(words[:2])
     typed = []

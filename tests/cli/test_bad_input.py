@@ -1,4 +1,4 @@
-"""Wrong specifications and hostile recordings: each is named, and nothing wrong is handed out."""
+"""Wrong specifications and hostile recordings: each is named, and no wrong result is returned."""
 
 import json
 import shutil

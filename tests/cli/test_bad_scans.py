@@ -74,7 +74,7 @@ def assert_is_within_its_claim(session):
 
 
 def turned(scan, deg_s):
-    """Turn a LiDAR about its axis while it scans."""
+    """Rotate a LiDAR about its axis while it scans."""
     angle = np.radians(deg_s) * 1e-9 * scan.offset_ns
     x, y, z = scan.points.T
     points = [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z]

@@ -83,7 +83,7 @@ def test_live_view_long_text_is_not_cut(width, height):
     """A wide terminal has a larger drawing."""
     lines = drawn(SAID, width=width, height=height)
     assert len(lines) <= height and max(len(line) for line in lines) <= width
-    # Beside each other stand the streams' columns, and the bars and the drawing.
+    # The streams' columns are side by side, as are bars and drawing.
     words = " ".join(" ".join(lines).split())
     for sentence in (SAID.detail, *SAID.notes, SAID.log[-1], SAID.goes_on):
         assert sentence in words

@@ -112,7 +112,7 @@ def test_simulate_bad_choices_exit_with_2(lce_rig, tmp_path, monkeypatch, words)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A quarter of a second as files."""
+    """A recording of a quarter of a second."""
     folder = tmp_path_factory.mktemp("recorded")
     profile = write_profile(folder, "frames", "events")
     words = ["--rig", profile, "--recording", folder / "r", "--duration", 0.25, "--seed", 2]

@@ -67,7 +67,7 @@ def running(busy):
 
 
 def press_until_it_ends(process):
-    """Press again and again; presses that come at once count as one."""
+    """Press repeatedly; simultaneous presses count as one."""
     pressed_s = time.monotonic()
     while process.poll() is None:
         assert time.monotonic() < pressed_s + SOON_S

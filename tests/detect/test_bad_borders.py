@@ -1,4 +1,4 @@
-"""Boards whose border is not seen whole are used, and each place on the border is as true as it claims."""
+"""Boards with an incomplete border are used, and errors of border points agree with their deviations."""
 
 from dataclasses import replace
 

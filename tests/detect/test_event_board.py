@@ -53,7 +53,7 @@ def find(events, stamp_ns=STAMP, limits=LIMITS, **more):
 
 
 def truth_m(stamp_ns):
-    """Where the board's middle is in the camera's x and y."""
+    """Position of the board's middle in the camera's x and y."""
     return STEADY.shift_px(stamp_ns * 1e-9) / FOCAL_PX * DEPTH_M
 
 

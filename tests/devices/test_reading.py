@@ -1,4 +1,4 @@
-"""Which driver a sensor gets; samples in order, the reason of the end, and reading again when it is back."""
+"""Choice of a sensor's driver; order of samples, reason for the end, and reconnection."""
 
 import time
 

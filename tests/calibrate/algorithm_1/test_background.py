@@ -1,4 +1,4 @@
-"""Ring ends before a background: by how much the board ends sooner there is found and made good."""
+"""Ring ends before a background: the shift of the board's edge is estimated and compensated."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def sooner(capture, by_m, echo, behind_m):
 
 
 def held(capture, is_behind, echo=0.0):
-    """Let a person stand close behind some ring ends: the board ends 8 mm sooner there, and more by echo."""
+    """Place a person close behind some ring ends: the board ends 8 mm earlier there, and more by the echo."""
     share = np.where(is_behind, echo, 0.0)
     return sooner(capture, 0.008 * is_behind + 0.02 * share, share, np.where(is_behind, 0.2, np.inf))
 

@@ -1,4 +1,4 @@
-"""The joint estimate against simulated truth: errors, claims, constants, several cameras, hard captures."""
+"""The joint estimate compared with simulated truth: errors, uncertainty, constants, several cameras, outliers."""
 
 from dataclasses import replace
 
