@@ -203,7 +203,7 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
         rate_hz, action = 0.0, "pps" if line == PPS_LINE else ""
         stamps_ns = [pulse.stamp_ns for pulse in board.pulses if pulse.sensor == line]
         if len(stamps_ns) > 1 and stamps_ns[-1] > stamps_ns[0]:
-            # By the board's clock; dropped lines count.
+            # Pulse rate by the board's clock, including pulses whose lines were lost.
             n_lost = board.status.n_lost_by_line.get(line, 0)
             rate_hz = 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
         figures: dict[str, Any] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}

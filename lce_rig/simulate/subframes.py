@@ -132,7 +132,7 @@ class MovingView:
 
 
 def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> None:
-    """Feed an event camera the motion after start_ns, which it has seen already, up to end_ns.
+    """Feed the motion after start_ns, up to end_ns, to an event camera.
 
     The steps are so short that edges move by a fraction of a pixel in each.
     """

@@ -199,7 +199,7 @@ def test_image_board_other_size_is_refused():
 
 
 def test_image_board_margin_changes_nothing():
-    """Nor does a readout that is cut short."""
+    """A readout that is cut short does not either."""
     pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
     padded = np.full((480, 640), 128, np.uint8)
     padded[:260, :346] = pixels

@@ -296,7 +296,7 @@ def test_bag_damaged_gives_source_error(small_bags, rig, kind, data):
 
 @pytest.fixture(scope="module")
 def small_bags(tmp_path_factory, write_bag, room, cloud_message, image_message):
-    """Content of a bag of each kind, and a path to write it damaged to."""
+    """Content of a bag of each kind, and a path for a damaged copy."""
     pixels = np.zeros((4, 6), np.uint8)
     bags = {}
     for kind in KINDS:

@@ -110,7 +110,7 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
     Args:
         scan: all returns.
         board: the board searched for.
-        limits: with the scan's noise.
+        limits: limits, including the scan's noise.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
     segments = cut_segments(coarse, limits.max_range_m)
@@ -168,8 +168,8 @@ def find_lidar_boards(
 
     Args:
         scan: one revolution, or part of one.
-        board: for its outer size.
-        limits: without noise.
+        board: board, which defines the outer size.
+        limits: limits, not including the scan's noise.
 
     Returns:
         At most 4 boards that do not overlap, or the refusal.
@@ -219,7 +219,7 @@ def measure_plate(
         board: nominal size.
         start: first guess of the plane (4,) as (n, d), its point (3,) in m that is the outline's origin, and
             the outline.
-        limits: with the scan's noise.
+        limits: limits, including the scan's noise.
         max_beyond: largest share of returns in the plane beyond the guessed outline.
 
     Returns:
@@ -322,9 +322,9 @@ def look_for_board(
 
     Args:
         scan: one revolution.
-        board: for its outer size.
+        board: board, which defines the outer size.
         T_lidar_board: (4, 4) predicted.
-        limits: without noise; the search has no maximum range.
+        limits: limits, not including the scan's noise; their maximum range is not used.
 
     Returns:
         The board, or the refusal.

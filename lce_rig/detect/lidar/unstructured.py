@@ -89,8 +89,8 @@ def find_unstructured_boards(
 
     Args:
         scan: one scan, or several of a still board together.
-        board: for its outer size.
-        limits: without noise.
+        board: board, which defines the outer size.
+        limits: limits, not including the scan's noise.
     """
     points = np.asarray(scan.points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -312,7 +312,7 @@ def measure_unstructured(
         board: nominal size.
         plane: (4,) first guess.
         centre: (3,) m, near the plate's middle.
-        limits: without noise.
+        limits: limits, not including the scan's noise.
     """
     distance_m = float(np.linalg.norm(centre))
     if plane[3] < np.cos(MAX_INCIDENCE_RAD) * distance_m:

@@ -18,7 +18,7 @@ from lce_rig.io.ros.bag_file import BagFile
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import fit_clock
 
-# Difference of two sensors' delays above which their clocks differ, s: messages wait less in any pipeline.
+# Difference of two sensors' delays above which their clocks differ, s: longer than delays in any pipeline.
 _MAX_DELAY_S = 2.0
 # Messages read to find the delays, in total and per topic: raw images have megabytes.
 _N_PROBED, _N_OF_TOPIC = 500, 5

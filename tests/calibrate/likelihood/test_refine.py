@@ -1,4 +1,4 @@
-"""The joint estimate compared with simulated truth: errors, uncertainty, constants, several cameras, outliers."""
+"""The joint estimate compared with simulated truth: errors, constants, several cameras, outliers."""
 
 from dataclasses import replace
 
