@@ -89,7 +89,7 @@ DEPLOY_WORSE = Kind(
 DEPLOY_OTHER_SERIAL = Kind(
     "deploy.other_serial",
     "{subject} has serial number {serial}, the deployed one {there}",
-    "Name the right target. If the sensor was replaced, force it with a reason.",
+    "Name the right target. For a replaced sensor, force it with a reason.",
 )
 DEPLOY_OLDER = Kind(
     "deploy.older",
