@@ -22,8 +22,8 @@ def _other_grid(finding: Finding) -> str:
 
 
 def _not_there(finding: Finding) -> str:
-    """Not where images and other captures have it, for the code in {cause}, with its figures."""
-    return f"not where the image and the other captures have it: {_cause(finding).text}"
+    """Not at the place expected from the image and other captures: the text of {cause}, with its figures."""
+    return f"not at the place expected from the image and other captures: {_cause(finding).text}"
 
 
 def _find_again(finding: Finding) -> str:
@@ -271,7 +271,7 @@ LIDAR_RAGGED_EDGES = Kind(
 LIDAR_NOT_WHERE_EXPECTED = Kind("lidar.not_where_expected", _not_there, _find_again)
 LIDAR_NOTHING_WHERE_EXPECTED = Kind(
     "lidar.nothing_where_expected",
-    "no plate of the board's size at the {distance_m:.1f} m where image and other captures have it",
+    "no plate of the board's size at the {distance_m:.1f} m expected from the image and other captures",
     "move the board clear of other things",
 )
 
