@@ -2,11 +2,10 @@
 """Measure what docs/benchmarks.md claims and print it as Markdown tables.
 
 --record writes the figures that pages show into docs/figures.json and fills the pages from it. Figures
-of scripts/fuzz.py and of `time` stand in that file by hand.
+of scripts/fuzz.py and of `time` are entered in that file by hand.
 
-Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
-it on a machine that does nothing else. Parts that read recordings by others take them from the folder that
-LCE_RIG_DATA names.
+Simulated boards are cached until simulator or detectors change; random choices are seeded. Run it on an idle
+machine. Parts that read recordings by others need their folder in LCE_RIG_DATA.
 """
 
 import argparse
@@ -110,7 +109,7 @@ def main() -> None:
 
 
 def _command(words: list[str]) -> str:
-    """Return the command as anyone may type it, without folders of this computer."""
+    """Return the command as typed, without folders of this computer."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--record", action="store_true")
     parser.add_argument("-o", "--output")

@@ -49,7 +49,7 @@ def imports(rooms: Iterable[str]) -> dict[str, set[str]]:
 
 
 def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """Leave out each import that follows from a chain of others."""
+    """Remove imports implied by a chain of others."""
 
     def reached(room: str) -> set[str]:
         return set().union(*({target} | reached(target) for target in graph[room]), set())

@@ -24,11 +24,11 @@ SIZE_PX = 192
 N_WARM_UP = 12
 COLS, ROWS = 7, 6  # squares
 MARGIN_PX = 6.0
-WRONG_GRID_PX = 5.0  # beyond, the finder took other corners than the board's
+WRONG_GRID_PX = 5.0  # beyond, the finder detected corners that are not the board's
 
 
 class BoardScene:
-    """One moving checkerboard and where its inner corners truly are."""
+    """One moving checkerboard and the true positions of its inner corners."""
 
     def __init__(self, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -50,7 +50,7 @@ class BoardScene:
 
 
 def corner_error_px(grey: np.ndarray, truth_px: np.ndarray) -> float | None:
-    """Find the board and give the rms distance of its corners from the truth; None where it is not found."""
+    """Detect the board and return the rms error of its corners; None if it is not detected."""
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(grey, (COLS - 1, ROWS - 1), flags=flags)
     if not found:

@@ -32,7 +32,7 @@ SAVE_EVERY_S = 60.0
 
 @dataclass
 class Progress:
-    """What a checkpoint must know to go on: where the run is and what it has cost."""
+    """State of a run in a checkpoint: progress and cost."""
 
     scene: int = 0
     updates: int = 0
@@ -108,7 +108,7 @@ class Trainer:
                 mean.lerp_(value, 1 - decay)
 
     def save(self, folder: Path) -> None:
-        """Write checkpoint.pt and reconstruction.onnx; each is whole at any moment."""
+        """Write checkpoint.pt and reconstruction.onnx; each is complete at any time."""
         state = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),

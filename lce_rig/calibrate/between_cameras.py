@@ -57,7 +57,7 @@ def match_cameras(
     Args:
         images: images of both cameras by capture.
         board: the board.
-        settings: settings of each camera; a lens there is used instead of a new one.
+        settings: settings of each camera; a lens given there is not fitted again.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsics.

@@ -1,13 +1,13 @@
 """Two LiDARs that saw the same boards: agreeing captures, and the initial guess of the relative pose.
 
-    place_boards      the boards' poses by each LiDAR alone, of maximum likelihood, with its constant errors
+    place_boards      maximum-likelihood poses of the boards from each LiDAR alone, with its constant errors
     find_consensus    the captures that agree on one rigid transform
     solve             Algorithm 1: the outliers, and where the estimate (`rig_estimate`) starts
 
 The boards' poses by the first LiDAR are compared with the second one's points and ring ends.
 
-A plate without print looks the same turned by 180 deg, a square one by 90 deg. Normals and middles of several
-boards decide T_12 without that turn, which then follows by capture.
+A plate without a pattern looks the same rotated by 180 deg, a square one by 90 deg. Normals and middles of
+several boards determine T_12 despite this ambiguity, which is then resolved for each capture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,8 +48,9 @@ class PlacedBoards:
 
     Attributes:
         T: (F, 4, 4) T_lidar_board.
-        cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
-        joint: the estimate they are of.
+        cov: (F, 6, 6) of each pose by errors that differ between captures, tangent (translation m, rotation
+            rad).
+        joint: the estimate that contains them.
     """
 
     T: Array
@@ -62,9 +63,9 @@ class LidarPair(NamedTuple):
 
     Attributes:
         start: pose of the second by Algorithm 1, with the captures that agree.
-        boards: by capture in both scans.
+        boards: boards in both scans, by capture.
         alone: estimate of the boards by each LiDAR alone.
-        joint: of the same boards, from the first LiDAR's poses: only to judge whether mountings changed.
+        joint: the same from the first LiDAR's poses, only to judge whether mountings changed.
         rejected: the other captures in which both see a plate.
         T_view: (4, 4) T_optical_first.
     """
@@ -105,8 +106,8 @@ def match_lidars(
     The optical frame has the first LiDAR's origin, z level towards the boards and y down.
 
     Args:
-        candidates: of each capture with the board in both scans; the first LiDAR's poses in its own frame.
-        first: by capture the places in its scan where the board may be.
+        candidates: one per capture with the board in both scans; the first LiDAR's poses in its own frame.
+        first: places in its scan where the board may be, by capture.
         board: the plate.
         settings: the profile's settings of each LiDAR.
 
@@ -156,7 +157,7 @@ def optical_frame(middles: Array) -> Array:
     """Rotate the axes of a LiDAR (x forward, z up) to a camera's (z forward, y down) facing the boards.
 
     Args:
-        middles: (F, 3) of the boards, frame of the LiDAR.
+        middles: (F, 3) middles of the boards, frame of the LiDAR.
 
     Returns:
         T_optical_lidar (4, 4).
@@ -182,7 +183,7 @@ def _turn_alike(T: Array, other: Array, board: Board) -> tuple[Array, float]:
     """Choose the rotation (4, 4) about the plate's normal that brings pose `other` closest to T (4, 4).
 
     Returns:
-        The turn, and the angle about the normal that is left, rad.
+        The rotation, and the remaining angle about the normal, rad.
     """
     sides = board.width_m, board.height_m
     n_fold = 4 if max(sides) < (1 + _NEARLY_SQUARE) * min(sides) else 2

@@ -1,13 +1,13 @@
 """Matching of LiDAR candidates and camera poses of each capture.
 
 A scan may contain decoys of the board's size, and an image of a plane two poses. Wrong pairs agree with no
-rigid extrinsic, right ones all with the same. Distances and angles between two boards are the same in both
+rigid transform, right ones all with the same. Distances and angles between two boards are the same in both
 sensors (1), for any extrinsics, which already excludes most wrong pairs. The pairs that agree with each other
 form a graph. The edges in the most triangles each propose extrinsics (Wahba on both normals and the line
 between the centres), the proposals are scored by all captures, and the best is refined on the pairs that
 agree with it.
 
-No assumption on how the sensors are mounted is made, only that both see the same side of the board.
+The only assumption about the mounting is that both sensors see the same side of the board.
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
     """Choose the pairs that agree with one rigid transform.
 
     Args:
-        candidates: of each capture, in any order, with all places in the scan where the board may be.
+        candidates: one per capture, in any order, with all places in the scan where the board may be.
         board: the board's size sets the scale at which an angle weighs as much as a distance.
 
     Raises:

@@ -50,7 +50,7 @@ def estimate_extrinsics(
     """Estimate T_cam_lidar from detections of the channels of one camera and a LiDAR.
 
     Args:
-        candidates: by channel, of each capture with detections of both sensors; channels whose captures agree
+        candidates: by channel, one per capture with detections of both sensors; channels whose captures agree
             on no extrinsics are skipped.
         board: the board's specification.
         settings: method, priors and tolerances.

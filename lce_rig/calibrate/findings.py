@@ -13,13 +13,13 @@ def _tilt(finding: Finding) -> str:
 
 
 def _elsewhere(finding: Finding) -> str:
-    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from where the image has the board."""
+    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from the board's pose in the image."""
     n, distance_m = finding.figures["n_candidates"], finding.figure("distance_m")
     which = "the only candidate" if n == 1 else f"the best of {n} candidates"
     apart = f"{distance_m:.1f} m" if distance_m >= 1 else f"{100 * distance_m:.0f} cm"
     return (
-        f"{which} in the scan is {apart}, {finding.figure('rotation_deg'):.0f} deg from where the image has "
-        "the board"
+        f"{which} in the scan is {apart}, {finding.figure('rotation_deg'):.0f} deg from the board's "
+        "pose in the image"
     )
 
 

@@ -36,7 +36,7 @@ class LidarErrors:
     Attributes:
         found: its constant errors; a laser's deviations are about the mean of all lasers.
         prior_sigma: (3,) deviations of a laser's errors about their mean without these sessions.
-        n_captures: by session.
+        n_captures: number of captures of each session.
         n_points: (K,) returns of each laser on boards.
         offset_m: constant error of all ranges, positive if too long; None if not significant.
             It is not part of the lasers' errors in `found`.
@@ -71,13 +71,13 @@ def estimate_lidar(
     Sessions are like cameras of one session: they share the LiDAR.
 
     Args:
-        sessions: observations of each; boards stood still.
+        sessions: observations of each session, with boards that stood still.
         board: the board.
-        T_cam_lidar: (4, 4) of each, as Algorithm 1 finds it.
+        T_cam_lidar: (4, 4) of each, from Algorithm 1.
         options: priors of the LiDAR's range errors; its known errors are not used.
         scale_sigma: relative standard deviation of the cameras' distances, against which a range offset is
             tested; that of the usual prior by default.
-        subtracted_m: from all ranges already.
+        subtracted_m: offset already subtracted from all ranges.
     """
     apart = [
         [replace(o, capture=f"{k}/{o.capture}") for o in observations]

@@ -62,7 +62,7 @@ class SharedScan:
     """One scan of the board and its images.
 
     Attributes:
-        captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
+        captures: names of the captures with this scan or a copy of it, sorted; its images may be in several.
         images: the board by channel, at least one.
         lidar: the board in the scan.
     """
@@ -87,7 +87,7 @@ def join_scans(
 ) -> tuple[list[SharedScan], dict[str, Refusal]]:
     """Group the channels' observations by scan, across captures.
 
-    Recordings often hold the images of each channel in a folder of its own, with copies of the same scans.
+    Recordings often have one folder per channel, with its images and copies of the same scans.
 
     Args:
         agreed: observations of each channel that agree, the most trusted channel first.

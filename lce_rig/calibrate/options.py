@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.lens.models import LensPrior
 from lce_rig.rig import BoardSettings, CameraSettings, LidarIntrinsicsSettings, LidarSettings
 
-# As a fraction of a square, where a profile states none: two millimetres in a metre.
+# Default standard deviation of a square's side, as a fraction: two millimetres per metre.
 _SQUARE = 2e-3
 
 
@@ -20,8 +20,8 @@ class Tolerances:
     """Standard deviations of a profile's lens and board.
 
     Attributes:
-        lens: the intrinsics with theirs.
-        square_size: relative.
+        lens: intrinsics with their standard deviations.
+        square_size: relative standard deviation of a square's side.
         pattern_offset_m: standard deviation of each coordinate of the pattern's centre on the plate.
         plate_m: standard deviation of each side of the plate.
         bow_m: standard deviation of the middle's height over the ends, along the width and along the height.
@@ -67,7 +67,7 @@ class KnownLidar:
         lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `likelihood.layout.LASER`.
         lasers_sigma: (3, K) their standard deviations about the mean of all lasers.
         lens: (2,) lateral m and vertical m per rad displacement of the lens.
-        lens_sigma: (2,) of it.
+        lens_sigma: (2,) its standard deviations.
     """
 
     rings: NDArray[np.intp]
@@ -105,7 +105,7 @@ class EstimateSettings(CalibrateOptions):
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
-        tolerances: tolerances of the profile's lens and board; None takes both as exact.
+        tolerances: tolerances of the profile's lens and board; None treats both as exact.
         lens: the session's lens; None to fit it first, with tolerances.
     """
 

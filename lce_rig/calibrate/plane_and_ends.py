@@ -1,16 +1,16 @@
 """Distances of the LiDAR's points and ring ends from the camera's board: residuals and their derivatives.
 
-With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR's leave
+With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR have the residuals
 
     plane     n . (g - R p - t)                                                                          (1)
     ring end  m . (h - R q - t) + d                                                                      (2)
 
 where n is the board's normal and g its middle as the camera sees them, m the outward normal of the edge
-nearest to the ring end and h a point on that edge. Ring ends lie by the edge shift d beyond the print.
+nearest to the ring end and h a point on that edge. Ring ends lie beyond the plate's edge by the edge shift d.
 
 Both are distances along a normal. `CaptureFeatures.board_rows` writes them linear in vec R and t, for moments
 of many points; `differentiate` gives their derivatives by the tangent of (R, t). Algorithm 1, the likelihood,
-the validation, the estimate of time offsets and the guidance take them from here.
+the validation, the time offsets and the guidance use these functions.
 """
 
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ EDGE_SHIFT_SIGMA_M = 0.015
 """Prior standard deviation of the distance of ring ends beyond an edge: about a beam's width."""
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
-_HALF_BEAM_M = 0.008  # of the beams that the priors of the shifts by the background are from
+_HALF_BEAM_M = 0.008  # half width of the beams behind the priors of the background's shifts
 BLENDS = 1
-"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
+"""Column of `describe_background`: whether the background's echo blends into the board's."""
 # Smallest cosine of incidence (78 deg) for projection along rays, which divides errors by it.
 _GRAZING_COSINE = 0.2
 
@@ -44,9 +44,9 @@ class CaptureFeatures:
         board: the board's size.
         plane_points: (N, 3) frame lidar, m.
         edge_points: (M, 3) ring ends, frame lidar, m.
-        lidar_normal: (3,) of the board, towards the LiDAR, frame lidar.
+        lidar_normal: (3,) normal of the board, towards the LiDAR, frame lidar.
         T_cam_board: (4, 4).
-        cov: (6, 6) of it, tangent (translation m, rotation rad).
+        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
     """
 
     capture: str
@@ -86,7 +86,7 @@ class CaptureFeatures:
         """Write the board coordinates of points (N, 3) of the LiDAR as rows that multiply [vec R; t; d; 1].
 
         Returns:
-            (N, 3, 14), no matter how far ring ends lie beyond the print.
+            (N, 3, 14); the edge shift is not included, its column is zero.
         """
         T_board_cam = invert(self.T_cam_board)
         R = T_board_cam[:3, :3]
@@ -103,7 +103,7 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
         observation: the boards of both sensors.
         board: the board's size.
         half_step: move ring ends outwards by half an azimuth step, to where the edge is expected: the edge
-            lies between the last ray that met the board and the next one. Without it, they are as measured.
+            lies between the last ray that hit the board and the next one. Otherwise they stay as measured.
     """
     surface, ends = observation.surface, np.zeros((0, 3))
     if isinstance(surface, LidarBoard):
@@ -124,9 +124,9 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
 def _meet_plane(points: Array, plane: Array) -> Array:
     """Intersect the ray of each point (N, 3) with the plane n.p + d = 0.
 
-    A LiDAR errs along its rays, so that the ray's intersection with the plane is the point it measured; along
-    the normal an error of range also moves the point sideways, by its size times the sine of the incidence.
-    Where rays graze the plane, points are projected along its normal.
+    A LiDAR errs along its rays, so the ray's intersection with the plane is the point it measured. A
+    projection along the normal would move the point sideways, by the range error times the sine of the
+    incidence. Where rays graze the plane, points are projected along its normal.
     """
     along = points @ plane[:3]
     is_grazing = -along < _GRAZING_COSINE * np.linalg.norm(points, axis=1)
@@ -148,7 +148,7 @@ def differentiate(normals: Array, levers: Array) -> Array:
 
     Args:
         normals: (..., 3) n.
-        levers: (..., 3) R p, the points turned but not moved.
+        levers: (..., 3) R p, the points rotated but not translated.
 
     Returns:
         (..., 6).

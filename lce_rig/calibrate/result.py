@@ -23,7 +23,7 @@ BY_ALGORITHM_1 = "algorithm_1"
 class Sensitivity:
     """Effect of a profile error on the extrinsics when used with the result's intrinsics.
 
-    Or the moves that would resolve a check's contradiction: the covariance holds both sides.
+    Also the moves that would resolve a contradiction found by a check: the covariance includes them.
 
     Attributes:
         source: the erroneous quantity, or the check.
@@ -68,26 +68,26 @@ class CalibrationEstimate:
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the noise of the captures
-            and from the sensors' errors that are common to all of them. Errors of lens and board are not in
-            it, but in `sensitivities`.
-        certificate: of Algorithm 1's final cost over all captures used, from whose solution other methods
-            start.
+            and from the sensors' errors that are common to all of them. Errors of lens and board are not
+            included, but in `sensitivities`.
+        certificate: certificate of Algorithm 1's final cost over all captures used; other methods start from
+            that solution.
         refused: why each other capture is not used.
         observations: capture -> the boards that were paired, as measured, for each capture used, sorted; one
             stands for all that hold the same scan.
         residuals: one per capture used, in the order of `observations`.
         diagnostics: further figures.
-        method: that found it, as `CalibrateOptions.method`.
+        method: method of the estimate, see `CalibrateOptions.method`.
         sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
-        lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
-        lens_of_base: the same of the second of two cameras.
+        lens: the session's lens, used to fit the boards' poses in the images; None without tolerances.
+        lens_of_base: the same for the second of two cameras.
         cov_with_lens: (6, P) cross-covariance of the extrinsics as used and the intrinsics.
         joint: the likelihood's estimate from the same captures, and which of its cameras this is.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: channels of the camera, with the time offset of each; empty if they were not separated.
-        channel_difference: of the extrinsics of two channels; None if they cannot be compared.
+        channel_difference: difference of the extrinsics of two channels; None if they cannot be compared.
         association: errors by which images and scans of some captures do not belong together.
     """
 
@@ -138,7 +138,7 @@ def report(
     """Measure the residuals of extrinsics and assemble the estimate.
 
     Args:
-        start: the captures, and where the estimate began.
+        start: the captures and the initial guess.
         T_cam_lidar: (4, 4).
         cov: (6, 6) of it, tangent (translation m, rotation rad).
         board: the board.
@@ -202,15 +202,15 @@ def capture_residual(
 ) -> CaptureResidual:
     """Measure the residuals of one capture under given extrinsics.
 
-    Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane
+    Points are used as measured; ring ends are moved along their rays onto the board's plane
     and compared with the profile's size, without half step or shift.
 
     Args:
         T_cam_lidar: (4, 4).
         observation: the boards of both sensors.
         board: the board's size.
-        held_out_m: passed through.
-        squares: size of the squares relative to that by which the image's board was posed.
+        held_out_m: held-out error, passed through.
+        squares: size of the squares relative to that used for the board's pose in the image.
     """
     observation = with_squares(observation, squares)
     pose = observation.pose

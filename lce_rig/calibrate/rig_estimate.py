@@ -1,8 +1,7 @@
 """Joint estimate of all sensors of a rig, from estimates of pairs of sensors.
 
-Pairs say which captures agree, where the estimate starts, and how large the noise is. In one likelihood each
-sensor has one pose, so that loops of poses close, and what one LiDAR's errors or the board's do to one pair
-they do to all.
+Pairs provide the captures that agree, the initial guess and the noise levels. In one likelihood each sensor
+has one pose, so that loops of poses close, and the errors of a LiDAR or the board affect all its pairs.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,7 +41,7 @@ class RigResult:
 
     Attributes:
         cameras, lidars: their names; the first LiDAR is the base, without LiDARs the first camera.
-        estimates: of each pair that was given; two LiDARs' is of the second in an optical frame of the first.
+        estimates: estimate of each given pair; of two LiDARs, in an optical frame at the first.
         joint: the estimate of all.
     """
 
@@ -70,7 +69,7 @@ class _Seen:
     Attributes:
         pair: the sensors.
         capture: the capture's name.
-        boards: in the scan of each LiDAR.
+        boards: boards in the scan of each LiDAR.
         image: image of the camera; None for two LiDARs.
     """
 
@@ -179,8 +178,8 @@ class _Frames:
     Attributes:
         n: number of placements.
         of_capture: placement number by capture name.
-        boards: by LiDAR and number.
-        images: by camera and number.
+        boards: boards by LiDAR and placement number.
+        images: images by camera and placement number.
     """
 
     n: int

@@ -1,14 +1,14 @@
 """The session's lens: the profile's intrinsics and the boards in the images, weighted by information.
 
-The LiDAR has no part in it. Its constant errors, a turn about the vertical of 0.1 to 0.2 deg in recordings,
-look like a shift of the principal point, and would move a lens that it may move. Lens and shape of the board
-therefore follow from the images and the profile alone; every pose of the board is fitted anew with them, and
+The LiDAR is not used. Its constant errors, a rotation about the vertical of 0.1 to 0.2 deg in recordings,
+look like a shift of the principal point and would bias the lens. Lens and shape of the board
+therefore follow from the images and the profile alone; every pose of the board is refitted with them, and
 the extrinsics are estimated with these poses. The covariance of lens and board is propagated to first order:
 
     cov = cov_T|K + J cov_K J^T,    cov_K' = J cov_K,    J = dT / dK + W                                   (1)
 
 Extrinsics and intrinsics of a result are used together. An error of the intrinsics that projects like a
-rotation W of the camera turns the extrinsics back by nearly as much; W in J keeps the difference.
+rotation W of the camera rotates the extrinsics back by nearly as much; W in J keeps the difference.
 """
 
 from collections.abc import Mapping, Sequence
@@ -68,7 +68,7 @@ class SessionLens:
     def errors(self, images: Sequence[ImageBoard]) -> tuple[Array, Array, Array]:
         """List independent errors of lens and board, of unit variance, that matter in F images.
 
-        Errors that move the poses of all images together by a fraction of their noise are left out.
+        Errors that move the poses of all images together by a fraction of their noise are omitted.
 
         Returns:
             (F, 6, n) tangents by which each moves the fitted poses, (n, P) by which it moves the intrinsics,
@@ -136,7 +136,7 @@ def fit_session_lens(
     """Fit the lens that all channels of a camera share, and the board's shape.
 
     Args:
-        images: by channel, of each capture.
+        images: boards in the images of all captures, by channel.
         board: the board's specification.
         prior: the profile's intrinsics.
 

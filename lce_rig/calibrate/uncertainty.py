@@ -41,7 +41,7 @@ def by_algorithm_1(
         start: the solution.
         joint: estimate from it.
         board: its specification.
-        lens: of the camera; None if exact.
+        lens: lens of the camera; None if exact.
     """
     likely = by_likelihood(start, joint, board, lens)
     apart = difference(start.T_cam_lidar, likely.T_cam_lidar)

@@ -94,8 +94,8 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     type=click.Choice(get_args(Method)),
     default=DEFAULT_METHOD,
     show_default=True,
-    help="Estimate by maximum likelihood, from the result of Algorithm 1 of LCE-Calib (ml), or by that alone "
-    "(paper).",
+    help="Estimate by maximum likelihood, starting from Algorithm 1 of LCE-Calib (ml), or by Algorithm 1 "
+    "alone (paper).",
 )
 @click.option(
     "--name",
@@ -107,21 +107,22 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     "--without",
     callback=split_names,
     metavar="CAPTURE[,CAPTURE]",
-    help="Reject these captures first, as `captures --reject` does; --restore there takes them back.",
+    help="Reject these captures first, like `captures --reject`; `captures --restore` brings them back.",
 )
 @click.option(
     "--rig",
     "profile",
     metavar="FILE",
-    help="Give the session this profile of the same rig first, as `intrinsics --save-profile` writes "
-    "one; the earlier one stays beside it as rig-1.yaml. With --name, only that result gets it, in its "
-    "folder, and the session keeps its own.",
+    help="Replace the session's profile first by this one of the same rig, such as a file of `intrinsics "
+    "--save-profile`; the earlier profile is kept as rig-1.yaml. With --name, only that result uses the "
+    "new profile, and the session keeps its own.",
 )
 @path_option(
     "--scene",
     "DRIVE",
-    "Without a board: correct the nominal extrinsics of --rig by the edges of this recording (repeatable), "
-    "whose views become SESSION. A session's own result is then --name [default: scene].",
+    "Calibrate without a board: correct the nominal extrinsics of --rig by the edges in this recording "
+    "(repeatable); its views are stored in SESSION. If DRIVE is a session, its result is named --name "
+    "[default: scene].",
     multiple=True,
 )
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
@@ -326,7 +327,7 @@ def _lacking(
 
     Args:
         wanted: cameras that should have extrinsics.
-        cameras: cameras of which the session holds captures.
+        cameras: cameras with captures in the session.
         calibrations: the results, at least one.
     """
     calibrated = {name for c in calibrations for name in (c.camera, c.lidar)}

@@ -31,7 +31,8 @@ from lce_rig.rig import Rig
 def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> None:
     """Report how many captures of SESSION (default: session/) are usable, and why the others are not.
 
-    Usable: both sensors detect the board, and agree on its place. Exits with 6 if no capture is usable.
+    A capture is usable if both sensors detect the board and agree on its place. Exits with 6 if no capture is
+    usable.
     """
     opened = lce.Session.open(session)
     if not opened.captures:
@@ -195,7 +196,7 @@ def _causes(
 
     Args:
         names: names of all captures.
-        refused: by name.
+        refused: refusals by capture name.
         plates: findings about the plate's size in all scans.
         session: path, for the commands of actions.
         is_whole: whether to list every capture with its figures.

@@ -54,8 +54,8 @@ def deploy(
 ) -> None:
     """Put the result of SESSION (default: session/) on a robot, all files at once.
 
-    A target is a folder on this computer or USER@HOST:PATH, reached by OpenSSH without a question. Robot
-    software reads PATH/current/. One rename makes the new files current, after they were read back; after any
+    A target is a folder on this computer or USER@HOST:PATH, reached by OpenSSH without a prompt. Robot
+    software reads PATH/current/. After the new files are read back, one rename makes them current; after any
     interruption, the robot has the earlier set or the new one. Earlier sets are kept.
 
     Refused with exit code 7: a failed result, another rig, another robot's name or serial numbers, captures
@@ -133,7 +133,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     _print_changes(plan, show.say)
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
-        show.say("nothing to change: these very files are in place")
+        show.say("nothing to change: these files are already in place")
     for how in dict.fromkeys(plan.changed.values()):
         names = [name for name, change in plan.changed.items() if change == how]
         show.say(f"  {_CHANGES.get(how, how)} {', '.join(names)}")

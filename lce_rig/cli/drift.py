@@ -55,8 +55,8 @@ def drift(
 
     RECORDING is a session or, with --rig, a folder of images and point clouds, a bag, an mcap, or several
     simultaneous recordings. With --rig and no RECORDING, the attached sensors are watched until Ctrl-C. Edges
-    of the scans are compared with edges of the images, and with the board if it is in view.
-    Exits with 0 if the extrinsics hold, with 7 if they changed, and with 6 if scene and board leave it open.
+    of the scans are compared with edges of the images, and with the board if it is in view. Exits with 0 if
+    the extrinsics hold, with 7 if they changed, and with 6 if scene and board are inconclusive.
     """
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:

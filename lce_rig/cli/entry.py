@@ -46,7 +46,7 @@ def limit_memory() -> None:
     """Limit the memory of this process, and of each that it starts, to a share of the computer's.
 
     Beyond the limit Python raises MemoryError, which `reading` names with its file. Data are limited, not
-    addresses: onnxruntime, Open3D and threads reserve far more of those than they use.
+    the address space: onnxruntime, Open3D and threads reserve far more of it than they use.
     """
     with suppress(OSError, ValueError, KeyError):
         lines = (line.split() for line in Path("/proc/meminfo").read_text().splitlines())

@@ -41,7 +41,7 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
     is_eager=True,
     expose_value=False,
     callback=_list_formats,
-    help="List the formats and their files, and end.",
+    help="List the formats and their files, and exit.",
 )
 @path_option(
     "--tree",
@@ -52,7 +52,7 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
 @path_option(
     "--into",
     "URDF",
-    "Set the sensors' joints in this URDF of the robot, in place of writing files; its earlier text "
+    "Set the sensors' joints in this URDF of the robot instead of writing files; its earlier text "
     "stays beside it.",
 )
 @path_option(

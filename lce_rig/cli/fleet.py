@@ -84,7 +84,7 @@ def fleet() -> None:
     type=click.Choice(get_args(Method)),
     default=DEFAULT_METHOD,
     show_default=True,
-    help="Estimate as `lce-rig calibrate` does with this method.",
+    help="Use this method of `lce-rig calibrate`.",
 )
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
@@ -105,7 +105,7 @@ def run(
     Each session is one task of a Dask cluster: detect, calibrate, verify, write. Results that the registry
     holds already, of the same captures, profile and version, are kept. Run it again after an interrupt to
     continue. A session that fails, takes too long, crashes or needs too much memory is recorded with the
-    cause and stops no other. Nothing below ROOT is written.
+    cause; others continue. ROOT is not written to.
     """
     from lce_rig.fleet.jobs import find_jobs
     from lce_rig.fleet.run import cluster, run_fleet
@@ -159,7 +159,7 @@ def run(
     help="Choose columns [default: all with --json, else the most important].",
 )
 @json_option
-@click.option("--rebuild", is_flag=True, help="Write the table again from the folders of all results first.")
+@click.option("--rebuild", is_flag=True, help="Rebuild the table from all results' folders first.")
 def table(registry: str, where: str, columns: list[str] | None, as_json: bool, rebuild: bool) -> None:
     """Print rows of the registry's table."""
     from lce_rig.fleet.registry import Registry
@@ -276,11 +276,11 @@ def deploy(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Put the newest result of each robot in a registry onto the robot, one after the other.
+    """Deploy the newest result of each robot in a registry to the robot, one after the other.
 
     Stops at the first robot that fails: not reached, not written, result refused, or command failed. Run it
-    again to continue; robots that hold their result are not written again. To pass over a
-    robot, use --where. Robots whose newest session failed are left out. Exits with 7 if it was stopped.
+    again to continue; robots that hold their result are not written again. To skip a
+    robot, use --where. Robots whose newest session failed are skipped. Exits with 7 if it was stopped.
     """
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.rollout import newest_results, roll_out

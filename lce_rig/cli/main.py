@@ -30,11 +30,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
     "lidar-intrinsics": ("lce_rig.cli.intrinsics", "Estimate a LiDAR's constant errors from sessions."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
-    "view": ("lce_rig.cli.verify", "Show the coloured cloud and the cameras in 3D."),
+    "view": ("lce_rig.cli.verify", "Show the coloured point cloud and the cameras in 3D."),
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.contents", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
-    "deploy": ("lce_rig.cli.deploy", "Put a result on a robot, ask what is there, or go back."),
+    "deploy": ("lce_rig.cli.deploy", "Deploy a result to a robot, query its state, or roll back."),
     "repeat": ("lce_rig.cli.contents", "Compare the calibrations of sessions, or the results of one."),
     "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }

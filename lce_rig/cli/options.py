@@ -57,7 +57,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print all fi
 explain_option = click.option("--explain", is_flag=True, help="Print all figures and causes.")
 
 robot_option = click.option(
-    "--robot", metavar="NAME", help="Name the robot that carries the rig; the result says so."
+    "--robot", metavar="NAME", help="Name the robot that carries the rig, for the result."
 )
 
 cameras_option = click.option(
@@ -69,7 +69,7 @@ def require_sensors(what: str, names: Sequence[str], choices: Collection[str]) -
     """Check that the rig has the requested sensors.
 
     Raises:
-        UsageError: it does not have one of them.
+        UsageError: a sensor is missing.
     """
     from lce_rig.core.errors import UsageError
 

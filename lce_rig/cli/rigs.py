@@ -188,7 +188,7 @@ def _find_recording(origin: str | None) -> Path | None:
     """Return the path of a recording; None for a profile's name or file.
 
     Raises:
-        SourceError: it is neither, or not there.
+        SourceError: the path is none of these, or does not exist.
     """
     if origin is None or (not Path(origin).is_dir() and Path(origin).suffix.lower() in ("", ".yaml", ".yml")):
         return None

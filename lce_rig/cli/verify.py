@@ -38,9 +38,9 @@ def verify(
 ) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
-    Images and a page of them replace those in SESSION/calibration/overlays/, with --result FILE those in
-    SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
-    captures contradict the extrinsics.
+    The images, and a page that shows them, replace those in SESSION/calibration/overlays/, with --result FILE
+    those in SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail
+    or these captures contradict the extrinsics.
     """
     if result is not None and name is not None:
         raise UsageError("--result and --name exclude each other", "Name a file or a result of the session.")
@@ -107,13 +107,13 @@ def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterat
     "--capture", metavar="NAME", help="Begin with this capture, such as 000003 [default: the first]."
 )
 @path_option(
-    "-o", "--output", "PNG", "Write a picture in place of opening a window; needs no display.", is_file=True
+    "-o", "--output", "PNG", "Write an image instead of opening a window; needs no display.", is_file=True
 )
 def view(session: Path, name: str | None, capture: str | None, output: Path | None) -> None:
     """Show the point cloud of SESSION (default: session/) in the colours of its cameras.
 
-    With wrong extrinsics, edges of things have the colours of their background. Points that no camera sees
-    are grey. Drag to turn, scroll to zoom; N and P change to the next and the previous capture.
+    With wrong extrinsics, edges of objects have the colours of their background. Points that no camera sees
+    are grey. Drag to rotate, scroll to zoom; N and P change to the next and the previous capture.
 
     Exits with 5 without a display, or if Open3D cannot open a window.
     """

@@ -20,8 +20,8 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
     """Find the board in frames, searching images in another process and scans in this one.
 
     Args:
-        tracker: has not been used before.
-        frames: in order of time.
+        tracker: an unused tracker.
+        frames: frames in order of time.
     """
     waiting: deque[tuple[Frame, Future[BoardDetection]]] = deque()
     with (

@@ -34,7 +34,7 @@ class BoardDetection:
 
     Attributes:
         images: detections by (camera, channel).
-        lidars: candidates within the profile's limits, by LiDAR; they may include other things of its size.
+        lidars: candidates within the profile's limits, by LiDAR; they may include other objects of its size.
         unseen: refusal by (camera, channel), of searched images without the board.
         unscanned: refusal by LiDAR, of searched scans without such a candidate.
         unfit: refusal by (camera, channel), of boards in `images` outside the profile's limits.
@@ -71,7 +71,7 @@ class CaptureMoment:
     Attributes:
         detection: the board in its frame.
         figures: how the board moved, kept with the capture: motion_m of a board that stood still; speed_mps,
-            unsteady_m (rms from a straight and steady way) and events_px (events per pixel of the board in
+            unsteady_m (rms from a straight, steady path) and events_px (events per pixel of the board in
             the second before) of one that moved; by_hand of one captured by a key.
     """
 
@@ -202,7 +202,8 @@ class BoardTracker:
     ) -> Refusal | None:
         """Refuse scans with candidates only at other positions than the board in the images.
 
-        Nominal extrinsics may be wrong: they decide for a camera and a LiDAR once they have fitted a moment.
+        Nominal extrinsics may be wrong: they are used for a camera and a LiDAR once they have fitted a
+            moment.
         """
         elsewhere: Refusal | None = None
         for (camera, _), board in images.items():
@@ -249,7 +250,7 @@ def _compare(
     """Compare candidates with the board pose expected from an image and the nominal extrinsics.
 
     Returns:
-        The best one's misfit, 1 for the largest that is allowed, and the refusal if it is larger.
+        The misfit of the best one, relative to the limit, and the refusal if it exceeds the limit.
     """
     T_lidar_cam = invert(nominal.to_matrix())
     poses = [pose for pose in (board.T_cam_board, board.T_cam_board_alternative) if pose is not None]

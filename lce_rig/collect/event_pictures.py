@@ -29,14 +29,14 @@ def with_event_pictures(
 
     Args:
         samples: scans and packets of events, the earliest first.
-        rig: says how images are made.
-        cameras: cameras of whose events images are wanted.
-        tally: receives why a scan got none.
+        rig: the profile, with the settings of the reconstruction.
+        cameras: cameras whose events are reconstructed.
+        tally: counts scans without an image, by cause.
         is_live: make each image a step of the network instead of an extra run, which is quicker; images
-            then depend on which scans came.
+            then depend on the scans received.
 
     Raises:
-        SourceError: onnxruntime is not installed; or, from the samples, they are torn.
+        SourceError: onnxruntime is not installed, or the recording is torn.
     """
     darkrooms = [_Darkroom(rig, camera, tally, is_live) for camera in sorted(cameras)]
     for sample in samples:

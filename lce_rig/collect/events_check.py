@@ -64,7 +64,7 @@ class EventsCheck:
         """Pass frames on, and compare the change between successive images with the events in between.
 
         Raises:
-            SourceError: a camera's events are rotated or mirrored against its frames.
+            SourceError: a camera's events are rotated or mirrored relative to its frames.
         """
         for frame in frames:
             for image in frame.images:

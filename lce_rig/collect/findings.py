@@ -19,7 +19,8 @@ GUIDE_NO_NOMINAL = Kind(
 )
 GUIDE_OF_PEERS = Kind(
     "guide.of_peers",
-    "no guidance for two sensors of one kind: {n_captures} placements at all distances, sides and tilts do",
+    "no guidance for two sensors of one kind: "
+    "{n_captures} placements at all distances, sides and tilts suffice",
     severity="note",
 )
 GUIDE_CONTINUES = Kind(
@@ -60,7 +61,7 @@ EVENTS_POLARITY = Kind(
 )
 EVENTS_LATE = Kind(
     "events.late",
-    "{subject}: the events are {late_s:+.2f} s late against the frames of the same camera",
+    "{subject}: the events are {late_s:+.2f} s late relative to the frames of the same camera",
     "enter cameras.{camera}.channels.{channel}.timestamps.expected_offset_s: {expected_offset_s:g}",
     severity="warning",
 )
@@ -70,7 +71,7 @@ LIDAR_ELSEWHERE = Kind(
     "lidar.elsewhere",
     "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "
     "pose predicted by the image and the nominal extrinsics",
-    "hold the board clear of other things, where more rings meet it",
+    "hold the board clear of other objects, where more rings hit it",
 )
 CALIBRATE_KNOWN_PLACEMENT = Kind(
     "calibrate.known_placement",

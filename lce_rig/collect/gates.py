@@ -1,14 +1,14 @@
 """Moments worth capturing: a board at rest, or the best moment at each place that a moving board passes.
 
-Events need motion, LiDAR wants stillness. A detection will do where, in a camera that sends events, the board
+Events need motion, the LiDAR needs stillness. A detection is usable if, in an event camera, the board
 
 - is not faster than `quality.max_board_speed_mps`,
-- made at least `quality.min_events_px` events a pixel of it in the second before,
-- and moves at 3 cm/s or more, or made plenty of events all the same: it has just stopped, or the rig moves.
-  Light that flickers does not count.
+- generated at least `quality.min_events_px` events per pixel in the second before,
+- and moves at 3 cm/s or more, or generated plenty of events nevertheless: it has just stopped, or the rig
+  moves. Events of flickering light do not count.
 
-Of such moments that follow each other within seconds and lie within a placement's reach of each other, the
-one is taken whose events are whole, and whose speed is nearest to 10 cm/s and most steady.
+Among such moments within seconds of each other and at one placement, the one with complete events and the
+steadiest speed nearest to 10 cm/s is chosen.
 """
 
 from collections import deque
@@ -54,11 +54,11 @@ class StillnessGate:
     the board moves, is lost, or has stood for `dwell_s`; its moment is then returned once.
 
     Args:
-        board: the profile's.
-        max_motion_m: largest motion of the board in a window; a hand never holds it quite still.
-        dwell_s: time after which a capture is taken without waiting for the board to be moved on.
-        takes_singles: whether a detection without others in two windows before and after it is a moment, as
-            in a recording triggered once per placement; its stillness cannot be checked.
+        board: the profile's board.
+        max_motion_m: largest motion of the board in a window; hands are never quite still.
+        dwell_s: time after which a capture is taken even if the board has not moved on.
+        takes_singles: whether an isolated detection, without others in two windows before and after it, is
+            accepted unchecked, as in a recording triggered once per placement.
         window_s: length of the window of stillness.
 
     Attributes:
@@ -223,7 +223,7 @@ def judge_detection(
         detection: the board in its frame.
         around: all detections shortly before and after, itself among them.
         rig: the profile.
-        takes_frames: whether frames are a moment without events, too.
+        takes_frames: whether frames alone make a moment, too.
 
     Returns:
         The moment, or its refusal; None if the tracker has counted the refusal.
@@ -321,10 +321,10 @@ class MotionGate:
 
     Args:
         rig: the profile.
-        taken: placements captured so far, and how far apart they must be; new ones are added.
+        taken: placements captured so far, with their minimum distance; new ones are added.
         tally: counts the refusals of all other detections.
         patience_s: time for which a moment waits for a better one of the same placement.
-        takes_frames: whether frames are captured where events are missing, too.
+        takes_frames: whether frames are also captured where events are missing.
 
     Attributes:
         judged: result for the last detection that could be judged: a usable moment, or its refusal; None if

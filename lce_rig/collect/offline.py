@@ -47,9 +47,9 @@ class CollectReport:
 
     Attributes:
         captured: names of the new captures.
-        n_known: pairs and moments that the session holds already, among rejected captures too.
+        n_known: pairs and moments already in the session, rejected captures included.
         refused: refusals of image-scan pairs, by label.
-        counts: refusals of moments of continuous recordings, counted.
+        counts: number of refusals of moments of continuous recordings, by cause.
         notes: choices, assumptions and skipped data, in words.
         errors: recordings that could not be read to their end; captures made before are kept.
         n_missing: captures short of the target.
@@ -82,14 +82,14 @@ def collect(
 
     A folder's pairs become captures unchanged. From a continuous recording, captures are taken while the
     board stands still in every sensor that sees it, at a placement that the session lacks. If it holds
-    events, captures are taken at the best moment of every place that the board passes slowly, and include the
-    raw events around it. Recordings of the same time by several recorders are read as one. Captures of an
-    earlier run are not made again.
+    events, captures are taken at the best time at each place that the board passes slowly, with the raw
+    events around it. Simultaneous recordings of several recorders are read as one. Captures of an earlier run
+    are not repeated.
 
     Args:
-        session: open for writing.
-        recordings: in any order.
-        n_wanted: captures wanted: recordings are read until the session has as many; None for all.
+        session: session, open for writing.
+        recordings: recordings in any order.
+        n_wanted: number of captures in the session at which to stop; None to read everything.
         progress: called with (done, total) samples or pairs.
 
     Raises:
@@ -133,7 +133,7 @@ class _Collector:
         """Capture every pair of a folder.
 
         Raises:
-            SourceError: not one pair could be read; its cause is that of the first.
+            SourceError: no pair could be read; the cause is that of the first.
         """
         failures: list[SourceError] = []
         n_left_out = 0
@@ -158,7 +158,7 @@ class _Collector:
             self._progress(done + 1, len(recording.pairs))
         if n_left_out:
             self.report.note(
-                [f"{n_left_out} pairs left out: the session holds {self._n_captures} captures, as wanted"]
+                [f"{n_left_out} pairs skipped: the session holds {self._n_captures} captures, as requested"]
             )
         if failures and len(failures) == len(recording.pairs):
             raise failures[0]
@@ -186,7 +186,7 @@ class _Collector:
         cameras = {camera for camera, _ in reconstructed}
         for moment in self._moments(recording, cameras, has_events=bool(events)):
             if self._is_enough():
-                self.report.note(["stopped early: the session has as many captures as wanted"])
+                self.report.note(["stopped early: the session has the requested number of captures"])
                 break
             # The capture keeps the events instead of the images reconstructed from them.
             images = moment.detection.frame.images
@@ -201,7 +201,7 @@ class _Collector:
         """Yield confirmed moments: selected by motion in recordings with events, else by stillness.
 
         Args:
-            recording: is read once.
+            recording: recording, read once.
             cameras: cameras with events and without images.
             has_events: whether events are kept with captures, so that the board has to move.
         """

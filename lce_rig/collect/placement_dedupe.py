@@ -31,7 +31,7 @@ class Placements:
     """Poses of the captured boards, by camera.
 
     Args:
-        min_move_m, min_turn_deg: a board that moved or turned as far stands somewhere new.
+        min_move_m, min_turn_deg: minimum translation or rotation of a board to a new placement.
     """
 
     def __init__(self, min_move_m: float = MIN_MOVE_M, min_turn_deg: float = MIN_TURN_DEG) -> None:

@@ -1,7 +1,7 @@
 """Run an object in a separate process, so that its work does not block this process's interpreter.
 
-Threads that read sensors ask for the interpreter often and briefly; to search images for a board, or to
-calibrate, holds it for long.
+Threads that read sensors need the interpreter often and briefly; searching images for a board and calibrating
+hold it for long.
 """
 
 import os
@@ -26,7 +26,7 @@ _CLOSE_S = 2.0
 class Worker:
     """An object of a picklable class in a separate process; open while its `with` block lasts.
 
-    A process that ends, as when memory is short, is started again once for the call that noticed.
+    A process that ends, for example for lack of memory, is restarted once for the current call.
     """
 
     def __init__(self, name: str, make: Callable[..., object], *arguments: object, nice: int = 0) -> None:
@@ -34,7 +34,7 @@ class Worker:
 
         Args:
             name: name of the process, for messages.
-            make: makes the object there, before its first call; a class or function of a module.
+            make: creates the object in that process; a class or function of a module.
             *arguments: its arguments.
             nice: added to the process's niceness.
         """
@@ -65,7 +65,7 @@ class Worker:
         """Call a method of the object, and return its result.
 
         Raises:
-            LceRigError: as the method does; SourceError if its process ends twice.
+            LceRigError: the method raised it; SourceError if its process ends twice.
         """
         with self._lock:
             for _ in range(2):

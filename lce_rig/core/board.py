@@ -15,7 +15,7 @@ BoardType = Literal["checkerboard", "charuco", "aprilgrid", "plain"]
 class Board:
     """A pattern on a plate: a checkerboard, a ChArUco board (OpenCV), an AprilGrid (Kalibr), or none.
 
-    A plain plate has no corners and squares of no size. Only LiDARs see its pose.
+    A plain plate has no corners and squares of no size. Only LiDARs detect its pose.
 
     Frame board: origin at the centre of the plate, x along its width, y up along its height (as the pattern
         is
@@ -32,7 +32,7 @@ class Board:
         marker_share: side of a ChArUco board's markers over that of its squares.
         gap_share: gap between the tags of an AprilGrid over their side.
         dictionary: dictionary of the markers, OpenCV's name without DICT_.
-        first_id: of the markers, at the top left of a ChArUco board and at the lower left of an AprilGrid.
+        first_id: id of the first marker: top left of a ChArUco board, lower left of an AprilGrid.
     """
 
     cols: int
@@ -123,7 +123,7 @@ class Board:
     def nearest_edge(self, xy_m: Array) -> NDArray[np.intp]:
         """Return the index of the edge nearest to each point in the board's plane, in the order of `edges`.
 
-        Beyond a corner two edges are equally near; there the bottom or the top counts.
+        Beyond a corner two edges are equally near: the bottom or the top edge is returned.
 
         Args:
             xy_m: (..., 2) x and y, frame board; further coordinates are ignored.

@@ -1,6 +1,6 @@
 """Limits on untrusted files: file types, and bytes to read, unpack and decode.
 
-A header may promise any size. The data read or unpacked at once are bounded by the size of one image, point
+A header may state any size. The data read or unpacked at once are limited to the size of one image, point
 cloud or chunk of messages; readers have no limits of their own.
 """
 
@@ -34,11 +34,11 @@ def require_file(path: Path, most_bytes: int | None = None) -> None:
     """Refuse devices, pipes and sockets, which have no end, and files that are too large.
 
     Args:
-        path: path of a file or folder; one that is missing passes, for its reader to name.
+        path: path of a file or folder; missing ones pass, as their reader reports them.
         most_bytes: largest size; None for files that are read piece by piece.
 
     Raises:
-        ValueError: the kind of file, or its size.
+        ValueError: not a plain file or folder, or too large.
     """
     try:
         status = path.stat()
@@ -80,12 +80,12 @@ def unpack(decompressor: Callable[[], Any], packed: bytes, most_bytes: int = MAX
 
     Args:
         decompressor: makes an object with the interface of `bz2.BZ2Decompressor`.
-        packed: the data.
-        most_bytes: most that they may unpack to.
+        packed: compressed data.
+        most_bytes: maximum size after decompression.
 
     Raises:
-        ValueError: they unpack to more.
-        EOFError: they are truncated.
+        ValueError: the data unpack to more.
+        EOFError: the data are truncated.
     """
     pieces, n_bytes = list[bytes](), 0
     while packed:
@@ -118,7 +118,7 @@ class Unpacking:
         """Read up to `size` bytes.
 
         Raises:
-            ValueError: it unpacks to far more than a recording does.
+            ValueError: the file unpacks to far more than a recording does.
         """
         piece = bytes(self._source.read(min(size, _STEP_BYTES)))
         self._n_left -= len(piece)
@@ -137,8 +137,8 @@ class Unpacking:
 def decoding() -> Iterator[None]:
     """Limit the memory used to decode a file; one file at a time.
 
-    Libraries allocate as much as a header promises, before they read the data. Beyond the limit their
-    allocations fail, which they report in ways of their own. Linux only; elsewhere without effect.
+    Libraries allocate as much as a header states before they read the data. Beyond the limit their
+    allocations fail, with errors that depend on the library. Linux only; elsewhere without effect.
     """
     with _decoding:
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)

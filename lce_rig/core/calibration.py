@@ -1,7 +1,7 @@
 """The result of a calibration: `Calibration`, one camera and one LiDAR, and `ResultFile`, result.json.
 
 The fields of both are the keys of the file, in the order of the file. pydantic reads and writes them by their
-annotations; a record that the program makes is not checked again. A further figure is one further field.
+annotations; records created by the program are not checked again. A further figure is one further field.
 """
 
 import json
@@ -40,19 +40,19 @@ _MOST = 1e100
 def _array(rows: Any) -> Array:
     array = np.array(rows, dtype=np.float64)
     if not (np.abs(array) <= _MOST).all():
-        raise ValueError("holds values that are no numbers")
+        raise ValueError("contains values that are not numbers")
     return array
 
 
 def _pose(rows: Any) -> Array:
-    parse_pose(rows)  # which also removes rounding: the file's own digits stay
+    parse_pose(rows)  # only a check: the digits of the file are kept
     return _array(rows)
 
 
 def _covariance(rows: Any) -> Array:
     cov = _array(rows)
     if cov.shape != (6, 6) or not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
-        raise ValueError("is no symmetric 6x6 matrix of numbers")
+        raise ValueError("is not a symmetric 6x6 matrix of numbers")
     if np.diag(cov).min() < 0:
         raise ValueError("a variance is negative")
     return cov
@@ -138,7 +138,7 @@ class Metrics:
 class Diagnostics:
     """Diagnostic figures of the method and of the checks on its result; NaN if missing.
 
-    result.json keeps each under its name here.
+    Keys of result.json have these names.
     """
 
     n_placements: float = math.nan  # number of different placements of the board among the captures used
@@ -157,12 +157,12 @@ class Diagnostics:
     edge_shift_echo_m: float = math.nan
     edge_shift_blended_m: float = math.nan
     edge_shift_blended_echo_m: float = math.nan
-    covariance_inflation: float = math.nan  # of the joint covariance, from leave-one-out results
+    covariance_inflation: float = math.nan  # factor on the joint covariance, from leave-one-out results
     range_offset_m: float = math.nan  # mean range error of all lasers
     mpe_corrected_m: float = math.nan  # Metrics.mpe_m corrected for the LiDAR's estimated errors
-    laser_spread_m: float = math.nan  # standard deviation of these
+    laser_spread_m: float = math.nan  # standard deviation of the lasers' range errors
     lens_vertical_m_per_rad: float = math.nan  # displacement of the LiDAR's lens
-    camera_scale: float = math.nan  # of the camera's distances
+    camera_scale: float = math.nan  # scale of the camera's distances
     noise_range_m: float = math.nan  # of ranges
     # Noise of the board's pose from the camera, not covered by corner noise.
     noise_tilt_deg: float = math.nan
@@ -234,7 +234,7 @@ class OtherCamera:
 
     Attributes:
         camera: name of the other one.
-        n_captures: that both used.
+        n_captures: number of captures used by both.
         T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
             extrinsics were not estimated together.
@@ -286,10 +286,10 @@ class SceneOpinion:
     """The extrinsics of a camera and a LiDAR tested on the scene, without the edges at the board.
 
     Attributes:
-        n_captures: compared; 0 if none has an image of the camera's frames and a scan.
+        n_captures: number of compared captures, with an image of the camera's frames and a scan.
         n_edges: number of edges of the scans, in or near their images.
         state: whether the edges agree with the extrinsics or contradict them; unknown if undetermined.
-        change: (6,) tangent from the extrinsics to those that fit best; None if none do clearly.
+        change: (6,) tangent from the extrinsics to those that fit best; None if there is no clear best.
         cov: (6, 6) of the change, that of the extrinsics included.
     """
 
@@ -322,23 +322,24 @@ class Calibration:
         cov_shared: (6, 6) the part of it that all sessions of one board have in common, as the profile states
             this; zero if unknown.
         contributions: the causes of `cov`, the largest first.
-        egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
+        egt_rotation_deg, egt_translation_m: error from a reference given by the user; None without one.
         verdict: "pass", "marginal" or "fail".
         findings: the reasons for it, worst first, and notes.
         captures_used: names of the captures behind the estimate.
         captures_refused: the reason for refusing each other capture.
         diagnostics: further figures.
-        method: that found the extrinsics, as `CalibrateOptions.method`.
-        uncertainty: `cov` as errors of points at several distances; empty if no lens was at hand.
+        method: method of the estimate, see `CalibrateOptions.method`.
+        uncertainty: `cov` as errors of points at several distances; empty without a lens.
         estimated_with: cameras whose extrinsics were estimated together with this one.
-        other_cameras: those that saw the same boards held still.
-        intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
-            None for those of the profile.
+        other_cameras: cameras that saw the same boards held still.
+        intrinsics: camera intrinsics that belong to the extrinsics, estimated from the profile's and the
+            session's images; None for the profile's.
         lidar_intrinsics: intrinsics of the second camera; None for a LiDAR.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
-        square_m: the side of a square by the profile and the LiDAR.
-        board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
+        square_m: side of a square, estimated from the profile and the LiDAR.
+        board_shape: (15,) deviation of the board's shape from the nominal one, `lens.fit.board_shapes`; None
+            if unknown.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
         residuals: residuals of each capture used.
@@ -467,7 +468,8 @@ class Provenance:
         date: date of the last capture, UTC, such as "2026-11-20T10:22:03Z": the time of this mounting; None
             without times in the recording.
         session_sha256: fingerprint of captures and profile, see `content_sha256`.
-        imported: when the last capture came into the session, in the same form; only where `date` is None.
+        imported: time at which the last capture entered the session, in the same form; only if `date` is
+            None.
     """
 
     robot: str = ""
@@ -505,8 +507,8 @@ class RigPoses:
     """The poses of the sensors of a rig on one of them.
 
     Attributes:
-        base: the sensor: the first LiDAR of the profile that has a result.
-        sensors: the others that results which have not failed connect with it.
+        base: that sensor, the first LiDAR of the profile with a result.
+        sensors: the other sensors, if connected with it by results that have not failed.
     """
 
     base: str
@@ -547,7 +549,7 @@ class ResultFile:
             if not all(np.isfinite(value).all() for value in values if isinstance(value, np.ndarray)):
                 raise ResultRefusedError(
                     f"a pose or covariance of {pair.camera} and {pair.lidar} is not finite",
-                    "Add captures: they leave a direction undetermined.",
+                    "Add captures: the present ones leave a direction undetermined.",
                 )
         document: dict[str, Any] = _file().dump_python(self, mode="json", by_alias=True)
         document["inputs_sha256"] = dict(sorted(document["inputs_sha256"].items()))

@@ -79,7 +79,7 @@ class Intrinsics:
     def max_radius(self) -> float:
         """Largest r = tan(angle) (radtan) or angle in rad (equidistant) up to which distortion is monotonic.
 
-        Beyond it the polynomial folds back and draws points from outside the field of view into the image.
+        Beyond it the polynomial folds back: points outside the field of view project into the image.
         """
         limit, n = (10.0, 20001) if self.model == "radtan" else (np.pi, 6284)
         r = np.linspace(0.0, limit, n)

@@ -26,7 +26,7 @@ class Image:
         host_ns: arrival at the host; None if unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
         count: the camera's running number of the image; gaps are lost ones; None if it does not count.
-        png: the file of the pixels, which a session keeps unchanged; None encodes them.
+        png: PNG file of the pixels, which a session stores unchanged; None to encode them.
     """
 
     sensor: str
@@ -199,7 +199,7 @@ class Stream:
     Attributes:
         sensor: the camera or LiDAR.
         channel: channel of a camera; "" for a LiDAR.
-        kind: a channel of events may also bring images that others reconstructed.
+        kind: kind of the data; channels of events may also contain images reconstructed by other programs.
     """
 
     sensor: str

@@ -25,15 +25,15 @@ class DataSheet:
     """One model of a LiDAR.
 
     Attributes:
-        name: the maker's.
-        source: where the figures are from.
+        name: the maker's name of the model.
+        source: origin of the figures.
         elevations_deg: elevations of each laser, in firing order; empty without rings.
         sequence_ns: time between two firings of one laser; None where the maker fixes `columns` instead.
         columns: firings of each laser per revolution, if they do not depend on the rate.
         firing_ns: time between two groups of lasers of one sequence.
         n_at_once: lasers that fire together.
-        azimuths_deg: of each laser from the rotor's, towards growing azimuth (Velodyne and Hesai count the
-            other way); empty for none.
+        azimuths_deg: azimuth of each laser relative to the rotor, towards growing azimuth (Velodyne and
+            Hesai count the other way); empty for none.
         heights_mm: height of each laser's optical centre; empty for none.
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
         range_m: nearest and farthest return.
@@ -95,7 +95,7 @@ class DataSheet:
     def rings_rad(self) -> Array:
         """The elevation of each ring (L,), from the lowest.
 
-        Without rings, that of lines about as far apart as returns, from which guidance predicts its figures.
+        Without rings, virtual lines with the density of the returns, for the guidance's predictions.
         """
         if not self.has_rings:
             low, high = self.fov_deg[1:]
@@ -135,7 +135,7 @@ TYPICAL = DataSheet(name="other", source="typical of spinning LiDARs", elevation
 def find_data_sheet(model: str) -> DataSheet | None:
     """Find a model by name in any spelling; None if unknown.
 
-    "VLP-16", "vlp16" and "Velodyne VLP 16 (Puck)" are one model; words behind a known name do not matter.
+    "VLP-16", "vlp16" and "Velodyne VLP 16 (Puck)" are one model; words after a known name are ignored.
     """
     words = model.split()
     names = (" ".join(words[:n]) for n in range(len(words), 0, -1))

@@ -59,9 +59,8 @@ class NotEnoughDataError(LceRigError):
     """Too few captures, or captures that leave a direction undetermined.
 
     Args:
-        what: as in every error.
-        hint: as in every error.
-        finding: the same as code and figures, where a calibration lacks captures.
+        what, hint: see `LceRigError`.
+        finding: code and figures, if a calibration lacks captures.
     """
 
     exit_code = 6
@@ -107,7 +106,7 @@ def reading(
     Devices, pipes and files that are too large are refused before they are opened.
 
     Libraries raise errors of many kinds for a damaged file: KeyError, struct.error, RuntimeError and errors
-    of their own. An LceRigError passes: it names its cause already. So do errors that only a bug in
+    of their own. An LceRigError passes, as it already names its cause. So do errors that only a bug in
     lce-rig can raise.
 
     Args:

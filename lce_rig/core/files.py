@@ -21,8 +21,8 @@ def read_json(path: Path) -> Any:
     """Read a JSON document from a file; see `parse_json`.
 
     Raises:
-        OSError: it is not there, or cannot be read.
-        ValueError: it is not JSON.
+        OSError: the file is missing, or cannot be read.
+        ValueError: the file is not JSON.
     """
     return parse_json(path.read_bytes())
 
@@ -31,7 +31,7 @@ def parse_json(data: bytes) -> Any:
     """Parse a JSON document in UTF-8; NaN and Infinity are not JSON.
 
     Raises:
-        ValueError: it is not such a document.
+        ValueError: the data are not such a document.
     """
     return pydantic_core.from_json(data.removeprefix(b"\xef\xbb\xbf"), allow_inf_nan=False)
 
@@ -49,7 +49,7 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
         (H, W) or (H, W, C), as OpenCV decodes it.
 
     Raises:
-        ValueError: it is truncated, damaged, or no image.
+        ValueError: the data are truncated, damaged, or not an image.
     """
     import cv2
 
@@ -65,7 +65,7 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise ValueError("it is damaged, too large, or no image that lce-rig reads")
+        raise ValueError("it is damaged, too large, or in an unsupported image format")
     return np.asarray(pixels)
 
 
@@ -75,7 +75,7 @@ def encode_events(events: Events) -> bytes:
     Timestamps are stored in microseconds (t_us) if all are whole ones, else in nanoseconds (t_ns).
 
     Returns:
-        The bytes of an .npz file, for its owner to put in place in one step.
+        The bytes of an .npz file, to be written in one step.
     """
     is_whole = not np.any(events.t_ns % _NS_PER_US)
     columns: dict[str, NDArray[Any]] = {
@@ -105,7 +105,7 @@ def decode_events(data: bytes, sensor: str) -> Events:
     """Read an archive that `encode_events` wrote.
 
     Raises:
-        Exception: as NumPy and zipfile raise it about damaged archives.
+        Exception: raised by NumPy or zipfile for damaged archives.
     """
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         columns = {name: np.asarray(archive[name]) for name in archive.files}

@@ -1,6 +1,6 @@
 """Facts about a sensor, a capture or a result, and their texts.
 
-A kind of finding is declared once, as a `Kind` in `findings.py` of the room that makes it:
+A kind of finding is declared once, as a `Kind` in `findings.py` of the package that reports it:
 
     TOO_DARK = Kind("image.too_dark", "too dark: grey {grey_99:.0f}", "expose longer")
 
@@ -83,10 +83,10 @@ class Finding:
         code: code of its kind, "family.name".
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
-        figures: by name with units ("rms_m"), for the words and for programs.
+        figures: values by name with unit ("rms_m"), for the text and for programs.
         action: the name of an alternative action of the kind; "" for the usual one.
         follows: the code of the finding that this one follows from; "" for a cause.
-        stored: text and action as read from a file; None renders the kind's own.
+        stored: text and action read from a file; None to render the kind's.
     """
 
     code: str
@@ -107,7 +107,7 @@ class Finding:
 
         Raises:
             KeyError: the finding has no such figure.
-            TypeError: it is not a number.
+            TypeError: the figure is not a number.
         """
         value = self.figures[name]
         if not isinstance(value, float | int):

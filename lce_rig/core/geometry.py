@@ -101,14 +101,14 @@ def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
     """Build a pose from parsed text: four lists of four numbers.
 
     Args:
-        value: as read, of any type.
+        value: parsed value of any type.
         rounding: tolerance on the entries of its rotation, for numbers printed with few digits.
 
     Returns:
-        (4, 4), its rotation made exact.
+        (4, 4), with its rotation orthonormalised.
 
     Raises:
-        ValueError: it is not a pose; the text follows the value's name.
+        ValueError: not a pose; the message continues after the value's name.
     """
     is_matrix = isinstance(value, list) and len(value) == 4
     if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in value):
@@ -204,7 +204,7 @@ class PoseDifference:
 
     Attributes:
         tangent: (6,) from one to the other (translation m, rotation rad).
-        cov: (6, 6) that it has if both are right.
+        cov: (6, 6) of the tangent if both are right.
     """
 
     tangent: Array
@@ -333,7 +333,7 @@ def relative_covariance(J: Array, cov_second: Array, cov_first: Array) -> Array:
     """Propagate covariances of two poses with independent errors to that of `relative_pose` (..., 6, 6).
 
     Args:
-        J: (..., 6, 12) derivatives from there.
+        J: (..., 6, 12) derivatives from `relative_pose`.
         cov_second: (..., 6, 6) of the second pose.
         cov_first: covariance of the first pose.
     """

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 EXIT_INTERRUPTED = 130
-INTERRUPTED = "interrupted; what was written so far is whole"
+INTERRUPTED = "interrupted; everything written so far is complete"
 #: Grace period for a clean shutdown. Compiled code and threads may not see the interrupt.
 GRACE_S = 1.2
 # One key press can arrive twice, from the terminal and from a program that passes it on.
@@ -117,8 +117,8 @@ def patience(grace_s: float) -> Iterator[None]:
 def without_interrupt() -> Iterator[None]:
     """Delay Ctrl-C until the end of the block, for imports of compiled libraries.
 
-    Stopped in their initialisation they end the process in ways of their own: Open3D by an exit code,
-    onnxruntime by an abort.
+    Interrupted during initialisation, they end the process themselves: Open3D with an exit code, onnxruntime
+    with an abort.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):

@@ -29,7 +29,7 @@ class Markers:
 
     Attributes:
         ids: (M,).
-        corners: (M, 4, 3) from each one's upper left clockwise as the pattern is looked at, frame board, m.
+        corners: (M, 4, 3) of each marker, clockwise from its upper left facing the pattern, frame board, m.
         cells: (M, 2) column and row of the corner of `Board.corners()` below and right of a ChArUco marker's
             square, and of the upper left corner of an AprilGrid's tag.
         is_white: (M, n, n) the modules with their black border, row by row from the upper left.
@@ -46,9 +46,9 @@ def markers_of(board: Board, *, is_legacy: bool = False) -> Markers:
     """List the markers of a ChArUco board or an AprilGrid.
 
     Args:
-        board: one that has markers.
-        is_legacy: with the markers of a ChArUco board where OpenCV before 4.6 drew them: its upper left
-            square is white if it has an even number of rows.
+        board: board with markers.
+        is_legacy: place the markers of a ChArUco board as OpenCV before 4.6 did: the upper left square is
+            white if the number of rows is even.
     """
     s, (x0, y0) = board.square_m, board.pattern_offset_m
     if board.type == "charuco":
@@ -101,7 +101,7 @@ def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
     """Find which points (..., 2) in the board's plane are printed black.
 
     The outer square at the top left of a checkerboard or ChArUco board is black. The squares between an
-    AprilGrid's tags make every corner of a tag a crossing.
+    AprilGrid's tags turn every corner of a tag into a crossing.
 
     Args:
         board: the board.

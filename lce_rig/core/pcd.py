@@ -1,7 +1,7 @@
 """Point clouds as PCD files from any writer.
 
 Headers are read as PCL reads them: any white space separates fields, and COUNT and POINTS may be missing.
-pypcd4 refuses such files, and reserves memory for as many points as a header promises.
+pypcd4 refuses such files, and allocates memory for as many points as a header states.
 
 References:
     https://pointclouds.org/documentation/tutorials/pcd_file_format.html
@@ -33,7 +33,7 @@ class _Header:
     Attributes:
         dtype: dtype of a point in the file, padding and repeated names included.
         kept: names of the fields that are read, with their names in `dtype`.
-        n_points: as promised.
+        n_points: number of points stated in the header.
         encoding: "ascii", "binary" or "binary_compressed".
     """
 
@@ -54,7 +54,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
         several fields of one name is read.
 
     Raises:
-        ValueError: it is not a PCD file, or damaged, or holds fewer points than its header promises.
+        ValueError: not a PCD file, damaged, or with fewer points than the header states.
     """
     if not data:
         raise ValueError("it is empty")
@@ -121,7 +121,7 @@ def _numbers(entries: dict[str, list[str]], key: str, n: int) -> list[int]:
     """Read the integers of an entry.
 
     Raises:
-        ValueError: it is missing, or has other than n.
+        ValueError: the entry is missing, or does not have n integers.
     """
     words = entries.get(key, [])
     if len(words) != n or not all(word.isdecimal() and len(word) < 16 for word in words):

@@ -24,11 +24,11 @@ _MOST_DIGITS, _FEW = 4, 4
 def _format(value: Any, spec: str, more: int = 0) -> str:
     """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {change_m:+mm}, {share:percent} scale and add the unit.
 
-    {axis:motion} names a motion by its code; {captures:few} lists the first of them.
+    {axis:motion} prints a motion by its code; {captures:few} lists the first of them.
 
     Args:
         value: the figure; those of a tuple are listed.
-        spec: as in a template.
+        spec: format specification of the template.
         more: digits beyond those of the spec.
     """
     if value is None:
@@ -126,9 +126,9 @@ def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
     """Describe how many captures to add, where to stand and how to tilt the board.
 
     Args:
-        n_captures: in all.
+        n_captures: total number to add.
         is_enough: whether they are predicted to suffice.
-        groups: of each the number, the distance in m, the place in the image if that is aside, and the tilts.
+        groups: number, distance in m, place in the image if off-centre, and tilts of each group.
     """
     placements = []
     for n, distance_m, place, sides in groups:

@@ -48,18 +48,18 @@ def solve_planar_pose(
     """Find T_cam_board and the second local minimum of the reprojection error.
 
     A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second:
-    under weak perspective both draw the same image, which is why the cost of a plane has two minima. Either
+    under weak perspective both give the same image, so the cost of a plane has two minima. Either
     start is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
 
     Args:
-        corners_px: (N, 2) measured, four or more; NaN where hidden.
+        corners_px: (N, 2) four or more measured corners; NaN where hidden.
         corners_board: (N, 3) with z = 0, frame board, m.
         intrinsics: the camera.
-        starts: T_cam_board (4, 4) near one minimum, or near both, where an image shortly before gave them:
-            the homography is then not needed, and fewer steps are.
+        starts: T_cam_board (4, 4) near one or both minima, from an image shortly before; then no homography
+            and fewer steps are needed.
 
     Returns:
-        The minima, or None if the corners admit no pose in front of the camera.
+        The minima, or None if the corners fit no pose in front of the camera.
 
     References:
         T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
@@ -120,7 +120,7 @@ def refine_pose(
     """Minimise the reprojection error of one board; see `refine_poses`.
 
     Returns:
-        T_cam_board (4, 4) at the minimum and its cost in px^2, infinite where the start projects nowhere.
+        T_cam_board (4, 4) at the minimum and its cost in px^2, infinite if the start cannot be projected.
     """
     T, cost = refine_poses(T_cam_board[None], corners_px[None], corners_board, _checked(intrinsics))
     return T[0], float(cost[0])
@@ -132,13 +132,13 @@ def refine_poses(
     """Minimise the reprojection errors of K independent boards by Levenberg-Marquardt.
 
     Args:
-        T_cam_board: (K, 4, 4) to start from.
-        corners_px: (K, N, 2) measured; NaN where hidden.
+        T_cam_board: (K, 4, 4) initial poses.
+        corners_px: (K, N, 2) measured corners; NaN where hidden.
         corners_board: (N, 3) frame board, m.
         project: pixels of points, and their derivative.
 
     Returns:
-        T_cam_board (K, 4, 4) at the minima and costs (K,) in px^2, infinite where a start projects nowhere.
+        T_cam_board (K, 4, 4) at the minima and costs (K,) in px^2, infinite if a start cannot be projected.
     """
     T, damping = T_cam_board, np.full(len(T_cam_board), 1e-4)
     residuals, J = linearise_poses(T, corners_px, corners_board, project)
@@ -168,8 +168,8 @@ def refine_poses(
 def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
     """Mirror the board's tilt in its line of sight, keeping its centre.
 
-    With S = diag(1, 1, -1) along the line of sight, R' = S R S turns the depth of every board point about the
-    centre's depth, up to the same image under weak perspective.
+    With S = diag(1, 1, -1) along the line of sight, R' = S R S mirrors the depth of every board point
+    about the centre's depth. Under weak perspective the image is the same.
 
     Args:
         T_cam_board: (4, 4).
@@ -185,7 +185,7 @@ def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
 def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
     """Decompose the homography board plane -> rays, H ~ [r1 r2 t]; None if the corners have no rays.
 
-    Rays beyond 90 deg from the axis have no x/z; turning all rays so that their mean is the axis keeps the
+    Rays beyond 90 deg from the axis have no x/z; rotating all rays so that their mean is the axis keeps the
     homography finite for wide fisheye images too.
     """
     if not np.all(np.isfinite(rays)):
@@ -228,7 +228,7 @@ def linearise_poses(
     The derivative of a point by the tangent is [I, -(R p)^]. Both are zero for hidden corners.
 
     Args:
-        T_cam_board, corners_px, corners_board, project: as in `refine_poses`.
+        T_cam_board, corners_px, corners_board, project: see `refine_poses`.
     """
     turned = corners_board @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
     pixels, by_point = project(turned + T_cam_board[:, None, :3, 3])

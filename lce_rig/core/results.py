@@ -39,7 +39,7 @@ class EventQuality:
     Attributes:
         events_px_s: events per second and pixel of the board, just before the image.
         events_px: events per pixel of the board in the time that the network remembers.
-        speed_mps, turn_deg_s: of the board about the time of the image.
+        speed_mps, turn_deg_s: speed and rotation rate of the board around the time of the image.
         speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
         smear_m: motion of the board while the LiDAR scans it.
     """
@@ -58,15 +58,16 @@ class LidarQuality:
     """Figures of the plate in a scan.
 
     Attributes:
-        width_m, height_m: of the plate as measured.
+        width_m, height_m: measured size of the plate.
         width_sigma_m, height_sigma_m: standard deviation of these.
-        n_rings, n_points: on the plate.
-        n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
-        n_ring_ends_dropped: those that do not fit the outline.
+        n_rings, n_points: number of rings and points on the plate.
+        n_ring_ends: number of ring ends at its outline; without rings, of located border pieces of about 7
+            cm.
+        n_ring_ends_dropped: ring ends that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: rms of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
-        beyond_share: returns in the plane beyond the outline over those on the plate.
+        beyond_share: ratio of returns in the plane beyond the outline to those on the plate.
         distance_m: distance of the plate's middle.
     """
 
@@ -122,8 +123,8 @@ class ImageBoard(BoardPose):
     """The board detected in one image; T_cam_board has the smaller reprojection error.
 
     Attributes:
-        corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, of boards whose
-            markers name the corners.
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, for boards
+            with markers.
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -131,7 +132,7 @@ class ImageBoard(BoardPose):
         stamp_ns: timestamp of the image; None if the recording carries no time.
         track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
             the board was tracked; None if there are none.
-        track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
+        track_T_cam_board: (K, 4, 4) poses in these images, for the same order of corners.
         track_cov: (K, 6, 6) of those poses, as `cov`.
     """
 
@@ -161,7 +162,7 @@ class BoardSurface:
     Attributes:
         points: (N, 3) on the board as measured, m.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the sensor (d > 0).
-        T_lidar_board: (4, 4) of the board in the sensor's frame; from a scan it is known up to the symmetries
+        T_lidar_board: (4, 4) of the board in the sensor's frame; a scan determines it up to the symmetries
             of a rectangle.
     """
 
@@ -180,15 +181,15 @@ class LidarBoard(BoardSurface):
 
     Attributes:
         ring: (N,) int16 of each point.
-        edge_points: (M, 3) first and last point of each ring on the board, as measured, m.
+        edge_points: (M, 3) first and last measured point of each ring on the board, m.
         edge_ring: (M,) int16.
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
         edge_behind_m: (M,) distance behind the board's plane of the ring's next return beyond the edge; inf
             without one. An object close behind blends into the beam's return.
-        edge_echo: (M,) share 0..1 of the received power that comes from that object if a beam meets it and
-            the board alike; 0 without an object. A beam that meets both reports the stronger echo.
-        edge_beam_m: (M, 2) of a board without rings: half the beam's width along the edge's normal, already
+        edge_echo: (M,) fraction 0..1 of the received power from that object if a beam hits it and the board
+            equally; 0 without an object. A beam that hits both reports the stronger echo.
+        edge_beam_m: (M, 2) without rings: half the beam's width along the edge's normal, already
             subtracted from the edge points, as the sum of its width's and height's parts; None with rings.
         edge_sigma_m: (M,) noise of each edge point along the edge's normal beyond that of a sharp border,
             standard deviation; None where the whole border is sharp.
@@ -274,8 +275,8 @@ class Observation:
 
     Attributes:
         capture: the capture's name.
-        pose: pose of the board by the first sensor.
-        surface: by the second.
+        pose: pose of the board in the first sensor.
+        surface: surface of the board in the second.
         others: further places where the second sensor may see it.
     """
 

@@ -46,8 +46,8 @@ class Product:
     """A model with supported packets.
 
     Attributes:
-        code: its factory byte.
-        name: the maker's.
+        code: factory byte of the product.
+        name: the maker's name.
         block_ns: from the first firing of a block to that of the next, with one return.
     """
 

@@ -166,7 +166,7 @@ class Detections:
         """List all pairs of the named LiDARs, and of cameras if one of them has no LiDAR.
 
         Args:
-            lidars: names.
+            lidars: names of the LiDARs.
             with_lidar: cameras with a LiDAR; by default those that share captures with one.
         """
         related = {pair.camera for pair in self.pairs} if with_lidar is None else set(with_lidar)
@@ -178,7 +178,7 @@ class Detections:
 
         Args:
             pair: the sensors.
-            board: whose corners are the points that the second of two cameras sees.
+            board: board whose corners are the points seen by the second of two cameras.
 
         Returns:
             By capture the first one's poses of the board, and the second one's surfaces.

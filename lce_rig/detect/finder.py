@@ -41,9 +41,9 @@ class Search(Generic[Boards]):
     """The result of a search in one image or scan.
 
     Attributes:
-        located: the board in an image, or the surfaces of its size in a scan, likeliest first, which can be
-            followed into the next one; or the refusal.
-        usable: those within the profile's limits, or the refusal.
+        located: the board in an image, or the surfaces of its size in a scan, likeliest first, for tracking
+            into the next sample; or the refusal.
+        usable: boards within the profile's limits, or the refusal.
     """
 
     located: Boards | Refusal
@@ -103,7 +103,7 @@ class BoardFinder:
         max_reprojection_px: float | None = None,
         is_thorough: bool = True,
     ) -> ImageBoard | Refusal:
-        """Find the board's corners with any intrinsics, without the profile's limits on boards.
+        """Find the board's corners for any intrinsics, without checking the profile's limits for captures.
 
         Args:
             image: image of a camera of the rig.
@@ -144,7 +144,7 @@ class BoardFinder:
 
         Args:
             scan: scan of a LiDAR of the rig.
-            poses: at least one; those about which nothing is found are omitted.
+            poses: at least one pose; the result omits those where nothing is found.
         """
         scan = self.rig.corrected(scan)
         look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
@@ -192,7 +192,7 @@ def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoar
     """Compare a board detected in an image with the profile's limits.
 
     Args:
-        sighting: one without quality is judged by its pose alone.
+        sighting: the board; without quality figures it is judged by its pose alone.
         limits: `quality` of the rig profile.
     """
     q = sighting.quality

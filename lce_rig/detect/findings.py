@@ -22,8 +22,8 @@ def _other_grid(finding: Finding) -> str:
 
 
 def _not_there(finding: Finding) -> str:
-    """Not where images and other captures have it, for the code in {cause}, with its figures."""
-    return f"not where the image and the other captures have it: {_cause(finding).text}"
+    """Not at the place expected from the image and other captures: the text of {cause}, with its figures."""
+    return f"not at the place expected from the image and other captures: {_cause(finding).text}"
 
 
 def _find_again(finding: Finding) -> str:
@@ -59,7 +59,7 @@ IMAGE_TOO_DARK = Kind(
 IMAGE_OVEREXPOSED = Kind(
     "image.overexposed",
     "overexposed: {white_share:percent} of the image is white",
-    "expose shorter or turn the board away from the light",
+    "shorten the exposure, or turn the board away from the light",
 )
 IMAGE_NO_BOARD = Kind(
     "image.no_board",
@@ -107,7 +107,7 @@ IMAGE_OTHER_LAYOUT = Kind(
 IMAGE_OTHER_SPACING = Kind(
     "image.other_spacing",
     "gaps between tags measure {share:g} of the side of a tag, {stated:g} in the profile",
-    "measure the print and correct board.tag_spacing",
+    "measure the pattern and correct board.tag_spacing",
 )
 IMAGE_FEW_CORNERS = Kind(
     "image.few_corners",
@@ -123,7 +123,7 @@ IMAGE_LOW_CONTRAST = Kind(
 IMAGE_BLURRED = Kind(
     "image.blurred",
     "too blurred: edges {edge_px:.1f} px wide (limit {max_edge_px:.1f} px)",
-    "hold the board still, expose shorter, come closer, focus the lens",
+    "hold the board still, shorten the exposure, come closer, or focus",
     actions={"events": MOVE_SLOWLY + "; come closer"},
 )
 IMAGE_NO_POSE = Kind(
@@ -131,7 +131,7 @@ IMAGE_NO_POSE = Kind(
 )
 IMAGE_MISFIT = Kind(
     "image.misfit",
-    "corners detected, the profile's intrinsics do not fit them: reprojection error {rms_px:.2f} px rms "
+    "corners detected, but the profile's intrinsics do not fit them: reprojection error {rms_px:.2f} px rms "
     "(limit {max_rms_px:.2f} px)",
     _LENS,
 )
@@ -230,7 +230,7 @@ LIDAR_OUTLINE = Kind(
 LIDAR_NO_BORDER = Kind(
     "lidar.no_border",
     "the border at {distance_m:.1f} m is located at {n_upright} upright and {n_level} level places only",
-    "free 10 cm around the board, with a wall behind; scan longer",
+    "keep 10 cm around the board free, with a wall behind; scan longer",
 )
 LIDAR_OUT_OF_VIEW = Kind(
     "lidar.out_of_view",
@@ -239,7 +239,7 @@ LIDAR_OUT_OF_VIEW = Kind(
 )
 LIDAR_TURNED = Kind(
     "lidar.turned",
-    "plate at {distance_m:.1f} m: beams meet it at over {max_turn_deg:.0f} deg",
+    "plate at {distance_m:.1f} m: beams hit it at more than {max_turn_deg:.0f} deg from its normal",
     "turn the board towards the LiDAR",
 )
 LIDAR_OTHER_PLATE = Kind(
@@ -271,7 +271,7 @@ LIDAR_RAGGED_EDGES = Kind(
 LIDAR_NOT_WHERE_EXPECTED = Kind("lidar.not_where_expected", _not_there, _find_again)
 LIDAR_NOTHING_WHERE_EXPECTED = Kind(
     "lidar.nothing_where_expected",
-    "no plate of the board's size at the {distance_m:.1f} m where image and other captures have it",
+    "no plate of the board's size at the {distance_m:.1f} m expected from the image and other captures",
     "move the board clear of other things",
 )
 

@@ -33,7 +33,7 @@ def open_live(rig: Rig) -> list[LiveSource]:
         rig: the profile.
 
     Raises:
-        SourceError: as `source_of` does.
+        SourceError: see `source_of`.
     """
     return [source_of(rig, sensor) for sensor in sensors(rig)]
 
@@ -42,7 +42,7 @@ def source_of(rig: Rig, sensor: str) -> LiveSource:
     """Build the source of one sensor; it opens with its `with` block.
 
     Raises:
-        SourceError: its driver's type belongs to another kind of sensor.
+        SourceError: the driver's type belongs to another kind of sensor.
     """
     module, name = LIVE[driver_of(rig, sensor)].split(":")
     make: Any = getattr(import_module(module), name)
@@ -54,7 +54,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
     """Name the driver that reads a sensor: the profile's, else the default of its model.
 
     Raises:
-        SourceError: there is none.
+        SourceError: no driver fits the model.
     """
     if sensor == BOARD:
         return "sync_board"
@@ -74,7 +74,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
         what = f"{kind} {sensor!r}: driver.type {driver.type!r} is not for a {kind}"
         raise SourceError(what, f"It can be {', '.join(known)}.")
     what = f"{kind} {sensor!r}: no driver goes with model {model!r}"
-    raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if it talks like one of these.")
+    raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if the device is compatible.")
 
 
 def edge_cameras(rig: Rig) -> list[str]:

@@ -1,7 +1,7 @@
 """A DAVIS346 read by dv-processing 2: events, frames and edges at its trigger input.
 
-External pulses cannot trigger its frames; the camera stamps their edges with its own clock, so that this
-clock can be fitted to that of the sync board which sends them.
+External pulses cannot trigger its frames. The camera timestamps their edges with its own clock, which can
+thus be fitted to the clock of the sync board that sends them.
 
 References:
     https://dv-processing.inivation.com, https://docs.inivation.com (external camera sync)
@@ -61,12 +61,12 @@ class OpenedCamera(NamedTuple):
 class DavisSource(LiveSource):
     """A DAVIS; see `LiveSource`.
 
-    Timestamps are the camera's, Unix time; a frame's is moved from the start to the middle of its exposure.
+    Timestamps are the camera's, in Unix time; those of frames are moved from start to middle of the exposure.
 
     Args:
         sensor: the camera's name in the profile.
         settings: its block of the profile.
-        open_camera: opens it; another input of dv-processing (file, network) does as well.
+        open_camera: opens the camera, or another input of dv-processing (file, network).
     """
 
     def __init__(
@@ -91,7 +91,8 @@ class DavisSource(LiveSource):
         """Open and set up the camera.
 
         Raises:
-            SourceError: it is absent, busy, another model, or does not support the profile's settings.
+            SourceError: the camera is absent, busy, another model, or does not support the profile's
+                settings.
         """
         self._opened = self._open_camera(self.sensor, self._settings)
         self._input: Any = self._opened.input
@@ -269,7 +270,7 @@ def number_of(sensor: str, name: str, value: Value) -> float:
     """Parse a control as a positive number.
 
     Raises:
-        SourceError: it is none.
+        SourceError: not a positive number.
     """
     if isinstance(value, bool | str) or value <= 0:
         what = f"camera {sensor!r}: driver.controls.{name}: {value!r} is not a positive number"
@@ -281,7 +282,7 @@ def bias_of(sensor: str, name: str, value: Value) -> tuple[int, int]:
     """Parse a control as a bias, coarse (0 to 7) and fine (0 to 255): "4,39".
 
     Raises:
-        SourceError: it is none.
+        SourceError: not a bias.
     """
     bias = re.fullmatch(r"\s*([0-7])\s*,\s*([0-9]{1,3})\s*", str(value))
     if bias is None or int(bias[2]) > 255:

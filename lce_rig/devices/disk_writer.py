@@ -20,8 +20,8 @@ T = TypeVar("T")
 class DiskWriter(Generic[T]):
     """Writes items to a session or a recording, in order of arrival.
 
-    Open while its `with` block lasts; items still waiting at its end are written first. After a failure it
-    writes nothing more.
+    Open while its `with` block lasts; items still waiting at its end are written first. After a failure,
+    writing stops.
 
     Attributes:
         path: path of the session or recording.

@@ -1,6 +1,6 @@
 """LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and the board's state from it.
 
-Bytes come in; pulses, clocks and problems come out, without a device or a thread. Sentences are framed as in
+Converts bytes to pulses, clocks and problems, without a device or a thread. Sentences are framed as in
 NMEA 0183: `$`, name and fields, `*`, and the exclusive or of the bytes in between.
 """
 
@@ -41,8 +41,8 @@ class PpsEdge(NamedTuple):
     Attributes:
         seq: running number.
         t_us: board time of the rising edge.
-        utc_s: the UTC second that begins with it; None where the board does not know.
-        origin: where the pulse comes from: "G", GPS; "I", the board's own clock; "N", there is none.
+        utc_s: the UTC second that begins with it; None if unknown to the board.
+        origin: source of the pulse: "G", GPS; "I", the board's own clock; "N", there is none.
     """
 
     seq: int
@@ -99,7 +99,7 @@ def write_sentence(body: str) -> bytes:
 def read_sentence(line: bytes) -> bytes:
     """Return the body of a sentence, between `$` and `*`.
 
-    Anything before the last `$` is skipped: a board that restarts breaks off in the middle of a line.
+    Anything before the last `$` is skipped: a restarting board leaves a line unfinished.
 
     Raises:
         ValueError: the line is damaged.
@@ -198,12 +198,12 @@ class BoardState:
 
     Attributes:
         reader: reads the lines, and counts damaged ones.
-        n_pulses: pulses handed on, by line.
-        n_lost_by_line: pulses whose messages never came, by line, from gaps in the running numbers.
+        n_pulses: pulses returned, by line.
+        n_lost_by_line: pulses whose messages were lost, by line, from gaps in the sequence numbers.
         n_restarts: restarts of the board.
         restarted_ns: time of the last restart, by the steady clock; None before one.
         heard_ns: time of the last message, or of opening the port, by the steady clock.
-        hello, error: the last of each; None before the first.
+        hello, error: last message of each kind; None before the first.
         pps: the last pulse per second, with its arrival.
         round_trip_ns: round trip of the last time request.
         host_tracker, utc_tracker: fits of the computer's time of day and of UTC to the board's clock, from

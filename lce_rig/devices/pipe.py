@@ -29,9 +29,8 @@ _EXAMPLE = "ffmpeg -loglevel error -f v4l2 -i /dev/video0 -pix_fmt bgr24 -f rawv
 class ImagePipeSource(LiveSource):
     """A camera read by a command from the profile; see `LiveSource`.
 
-    The command writes images of the profile's size and pixel_format, without anything between them.
-    Such a stream carries no timestamps: those given are the arrival of an image's last byte, and the status
-    says so.
+    The command writes images of the profile's size and pixel_format, without padding. The
+    stream carries no timestamps: images get the arrival time of their last byte, as the status states.
 
     Args:
         sensor: the camera's name in the profile.
@@ -39,7 +38,7 @@ class ImagePipeSource(LiveSource):
     """
 
     def __init__(self, sensor: str, settings: CameraSettings) -> None:
-        hint = f"Run its command in a shell: does it write images? {' '.join(settings.driver.command)}"
+        hint = f"Run its command in a shell and check for images: {' '.join(settings.driver.command)}"
         super().__init__(sensor, f"camera {sensor!r}", _SILENCE_S, hint)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
@@ -51,7 +50,7 @@ class ImagePipeSource(LiveSource):
         """Start the command.
 
         Raises:
-            SourceError: there is none, or it cannot be started.
+            SourceError: there is no command, or it cannot be started.
         """
         command = self._settings.driver.command
         if not command:
@@ -62,7 +61,7 @@ class ImagePipeSource(LiveSource):
         wanted = self._settings.driver.pixel_format or _USUAL_FORMAT
         code = find_format(wanted)
         if code is None or FORMATS[code].is_compressed:
-            what = f"{self._label}: raw images of driver.pixel_format {wanted!r} are not read"
+            what = f"{self._label}: raw images of driver.pixel_format {wanted!r} are not supported"
             raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
             raise SourceError(what, f"It can be {raw}, or missing for {_USUAL_FORMAT}.")
         self._decoder, self._rest = PixelDecoder(code, *self._settings.resolution_px), bytearray()
@@ -73,7 +72,7 @@ class ImagePipeSource(LiveSource):
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
-                start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
+                start_new_session=True,  # Ctrl-C reaches only this program, which then stops the command
             )
         except OSError as error:
             hint = "Install the program, or give its full path."

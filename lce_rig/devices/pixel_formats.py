@@ -76,14 +76,14 @@ class PixelDecoder:
     Args:
         code: one of FORMATS.
         width, height: px.
-        stride: bytes from row to row; 0 without padding.
+        stride: bytes from row to row; 0 if there is no padding.
 
     Attributes:
         n_bytes: least number of bytes of a whole image; 1 for compressed ones.
     """
 
     def __init__(self, code: str, width: int, height: int, stride: int = 0) -> None:
-        import cv2  # takes a second: now, not when the first image waits to be fetched
+        import cv2  # takes a second, so not when the first image arrives
 
         self.code = code
         self._cv2 = cv2
@@ -102,7 +102,7 @@ class PixelDecoder:
             (H, W) grey or (H, W, 3) BGR.
 
         Raises:
-            ValueError: it is torn, damaged or of another size.
+            ValueError: the image is torn, damaged or of another size.
         """
         width, height = self._size
         if len(data) < self.n_bytes:

@@ -32,8 +32,8 @@ class SourceStatus:
 
     Attributes:
         sensor: the sensor's name in the profile.
-        n_samples: samples handed on since it was opened.
-        n_dropped: samples dropped because they were not taken in time.
+        n_samples: samples delivered since opening.
+        n_dropped: samples dropped because they were not read in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
         rate_hz: samples per second over the last seconds; 0 before the second sample.
         clock: clock of the timestamps, and its relation to others; None before the first sample.
@@ -84,8 +84,8 @@ class Inbox(Generic[T]):
 
         Args:
             sender: sender of the items.
-            items: in order.
-            n_slots: most items of this sender that may wait; beyond, the oldest is dropped.
+            items: items in order.
+            n_slots: maximum number of waiting items of this sender; beyond, the oldest is dropped.
         """
         with self._changed:
             for item in items:
@@ -189,7 +189,7 @@ class LiveSource(ABC):
         """Open the device; on return it can be read. After a failure, `close` is called.
 
         Raises:
-            SourceError: it is absent, busy or of another model; the hint says what to check.
+            SourceError: the device is absent, busy or of another model; the hint states what to check.
         """
 
     @abstractmethod
@@ -197,7 +197,7 @@ class LiveSource(ABC):
         """Return the received samples; waits briefly at most.
 
         Raises:
-            SourceError: the device failed for good.
+            SourceError: the device failed permanently.
         """
 
     @abstractmethod
@@ -217,8 +217,8 @@ class LiveSource(ABC):
         """Start a thread that opens the device and reads it into a queue.
 
         Args:
-            inbox: takes the samples.
-            reopen_every_s: between attempts to open a lost device again; None for none.
+            inbox: receives the samples.
+            reopen_every_s: interval between attempts to reopen a lost device; None for no attempts.
         """
         self._inbox, self.lost, self.opened_s, self._rate = inbox, None, None, RateMeter()
         self._stopping.clear()
@@ -304,7 +304,7 @@ class AttachedSensors:
     others continue.
 
     Attributes:
-        sources: by the sensor's name.
+        sources: sources by sensor name.
     """
 
     def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float | None = REOPEN_EVERY_S) -> None:
@@ -333,7 +333,7 @@ class AttachedSensors:
         """Open every sensor.
 
         Raises:
-            SourceError: of the first that cannot be opened; its hint names the others.
+            SourceError: a sensor cannot be opened; the hint lists any further ones.
         """
         self.start()
         try:
@@ -343,7 +343,7 @@ class AttachedSensors:
             failures = [source.lost[0] for source in closed if source.lost is not None]
             if failures:
                 hints = [failures[0].hint, *(f"Also: {other.what}" for other in failures[1:])]
-                hints.append("`lce-rig doctor --rig RIG` looks at every device.")
+                hints.append("`lce-rig doctor --rig RIG` checks every device.")
                 raise SourceError(failures[0].what, "\n  ".join(hint for hint in hints if hint))
         except BaseException:  # Ctrl-C while waiting, too.
             self.stop()

@@ -24,8 +24,8 @@ _DISCOVERY_STEP_S = 0.1
 class Ros2Source(LiveSource):
     """A topic of sensor_msgs/Image, CompressedImage or PointCloud2; see `LiveSource`.
 
-    Messages arrive serialised and are decoded as those of a bag are. The topic is the profile's for bags.
-    Timestamps are those of the headers, which are as good as the publishing driver makes them.
+    Messages arrive serialised and are decoded like those of a bag. The topic is the profile's topic for bags.
+    Timestamps are those of the headers; their quality depends on the publishing driver.
 
     Args:
         sensor: the sensor's name in the profile.
@@ -41,7 +41,7 @@ class Ros2Source(LiveSource):
             named, label = settings.topic, f"LiDAR {sensor!r}"
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
-        hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
+        hint = f"Check that its driver publishes: `ros2 topic hz {self._topic}`."
         super().__init__(sensor, label, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
@@ -54,7 +54,7 @@ class Ros2Source(LiveSource):
         """Join the ROS graph and subscribe.
 
         Raises:
-            SourceError: rclpy cannot be imported, the profile names no topic, or nothing publishes it.
+            SourceError: rclpy cannot be imported, the profile names no topic, or no node publishes it.
         """
         if not self._topic:
             block = "cameras" if self._target.channel is not None else "lidars"
@@ -123,7 +123,7 @@ class Ros2Source(LiveSource):
         """Wait until the topic is published, and return its type without ROS 2's "/msg".
 
         Raises:
-            SourceError: it is not, or is of another type.
+            SourceError: the topic is not published, or is of another type.
         """
         until_s = time.monotonic() + _DISCOVERY_S
         while True:

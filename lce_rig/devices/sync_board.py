@@ -38,11 +38,11 @@ _N_HEARD_BYTES = 40
 class SyncBoard(LiveSource):
     """An attached sync board; a `LiveSource` of pulses.
 
-    A reader thread always drains the port: some boards block, and hold their pulse high, if it is not.
+    A reader thread always drains the port: otherwise some boards block and hold their pulse high.
 
     Args:
-        settings: how the board is reached, and which camera each line triggers.
-        hello_s: how long to wait for its first words.
+        settings: the board's port, and the camera triggered by each line.
+        hello_s: longest wait for its first message.
     """
 
     def __init__(self, settings: SyncSettings, hello_s: float = HELLO_S) -> None:
@@ -64,7 +64,7 @@ class SyncBoard(LiveSource):
         """Open the port, wait for the board's first message, configure its lines and start them.
 
         Raises:
-            SourceError: the port cannot be opened, or the board is silent or talks otherwise.
+            SourceError: the port cannot be opened, or the board is silent or uses another protocol.
         """
         # DTR and RTS stay low on opening: many boards wire them to the reset. Some kernels still raise them
         # briefly.
@@ -96,7 +96,7 @@ class SyncBoard(LiveSource):
         hello = self._state.hello
         if hello is not None and hello.version != lce1.VERSION:
             raise SourceError(
-                f"{self._label} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
+                f"{self._label} uses version {hello.version} of LCE1, but this program {lce1.VERSION}",
                 "Flash the firmware of this version of lce-rig.",
             )
 
@@ -112,7 +112,7 @@ class SyncBoard(LiveSource):
         Their `sensor` is the camera, or "pps"; timestamps are the board's own time.
 
         Raises:
-            SourceError: the board was unplugged, or fell silent for good.
+            SourceError: the board was unplugged, or fell silent permanently.
         """
         assert self._port is not None  # it is open
         early, self._early = self._early, []
@@ -165,7 +165,8 @@ class SyncBoard(LiveSource):
         """Start the trigger pulses of the cameras; sequence numbers continue.
 
         Args:
-            rate_hz: of all lines instead of the profile's: slow pulses allow images to be matched to pulses.
+            rate_hz: rate of all lines, for slow pulses that images can be matched to; None for the
+                profile's.
         """
         with self._lock:
             self._rate_hz = rate_hz

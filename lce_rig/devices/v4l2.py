@@ -72,9 +72,9 @@ def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us:
         t_trigger + delay   + m l + e/2                                                                    (4)
 
     Args:
-        mark: the moment.
+        mark: the timestamped moment.
         timing: line time and delay.
-        n_rows: H, of the image.
+        n_rows: H, number of rows of the image.
         exposure_us: exposure time of a row; None if unknown, which counts as 0.
     """
     half_us, line_us = 0.5 * (exposure_us or 0.0), timing.line_time_us
@@ -92,9 +92,9 @@ def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
     """Find the moment that a timestamp marks: from the profile, else from a buffer's flags.
 
     Args:
-        settings: the camera's.
-        flags: the kernel's, of a buffer.
-        driver: its name; Jetson's flags are wrong.
+        settings: settings of the camera.
+        flags: the kernel's flags of a buffer.
+        driver: name of the driver; Jetson's flags are wrong.
     """
     if settings.frame_timing.mark != "auto":
         return settings.frame_timing.mark
@@ -187,8 +187,8 @@ class StampClock:
 class V4l2Source(LiveSource):
     """A camera at /dev/video*; see `LiveSource`.
 
-    Timestamps are mid exposure in the computer's UTC: the driver's, corrected by (1) to (4) and read by the
-    clock that they fit. Without such a clock they are times of arrival, and the status reports it.
+    Timestamps are mid exposure in the computer's UTC: the driver's, corrected by (1) to (4) and converted
+    from the clock that they fit. Without such a clock they are times of arrival, as the status reports.
 
     Args:
         sensor: the camera's name in the profile.
@@ -215,7 +215,7 @@ class V4l2Source(LiveSource):
         """Open, set up and start the camera.
 
         Raises:
-            SourceError: it is absent, busy, or does not support the profile's settings.
+            SourceError: the camera is absent, busy, or does not support the profile's settings.
         """
         driver = self._settings.driver
         if driver.device is None:
@@ -269,7 +269,7 @@ class V4l2Source(LiveSource):
         """Negotiate the format of the images.
 
         Raises:
-            SourceError: another size than the intrinsics', or no pixel format that is read here.
+            SourceError: the size differs from the intrinsics', or no pixel format is supported.
         """
         device, (width, height) = self._device, self._settings.resolution_px
         where = f"camera {self.sensor!r}: {device.path} ({device.card})"

@@ -42,9 +42,9 @@ def _lay_out(name: str, fields: str, base: type = Structure, **kinds: Any) -> An
 
     Args:
         name: name of the structure.
-        fields: name, kind and, of an array, number of each, as "driver char 16, version u32".
+        fields: name, type and, for arrays, length of each, such as "driver char 16, version u32".
         base: Structure or Union.
-        kinds: structures that are parts of it, by the names of their fields.
+        kinds: nested structures, by the names of their fields.
     """
     layout = []
     for field in fields.split(","):

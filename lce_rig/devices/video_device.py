@@ -38,7 +38,7 @@ class VideoDevice:
         sensor: name of the camera, for messages.
 
     Raises:
-        SourceError: it is absent, forbidden, or no camera.
+        SourceError: the device is absent, not accessible to this user, or not a camera.
     """
 
     def __init__(self, path: str, sensor: str) -> None:

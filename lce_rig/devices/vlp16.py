@@ -1,6 +1,6 @@
 """A VLP-16 on the network: UDP packets in, scans of one revolution each out.
 
-The kernel stamps the arrival of datagrams and counts those that it drops.
+The kernel timestamps the arrival of datagrams and counts those that it drops.
 """
 
 import contextlib
@@ -47,13 +47,13 @@ _TIMESPEC = struct.Struct("@ll")
 class Vlp16Source(LiveSource):
     """The scans of an attached VLP-16; open while its `with` block lasts.
 
-    `driver.address` is the LiDAR's address, by default that of the VLP-16 heard first; `driver.port` is the
-    port of data packets (2368); `driver.controls` as `read_controls` reads them.
+    `driver.address` is the LiDAR's address, by default that of the first VLP-16 received; `driver.port` is
+    the port of data packets (2368); `driver.controls`: see `read_controls`.
 
     Args:
         sensor: the sensor's name in the profile.
         settings: its block of the profile.
-        silence_s: time without packets after which it counts as lost.
+        silence_s: time without packets after which the sensor counts as lost.
     """
 
     def __init__(self, sensor: str, settings: LidarSettings, silence_s: float = SILENCE_S) -> None:
@@ -72,7 +72,7 @@ class Vlp16Source(LiveSource):
         """Open the ports and wait for the first packet.
 
         Raises:
-            SourceError: no packets come, or those of another model; a port is held by another program;
+            SourceError: no packets arrive, or those of another model; a port is held by another program;
                 velodyne-decoder is not installed.
         """
         stream = Vlp16Stream(self.sensor, self._settings)
@@ -206,18 +206,18 @@ class UdpPort:
     Attributes:
         port: its number.
         granted_bytes: receive buffer that the kernel granted.
-        n_overflowed: datagrams that the kernel dropped because they were not taken in time.
+        n_overflowed: datagrams that the kernel dropped because they were not read in time.
     """
 
     def __init__(self, port: int, what: str) -> None:
         """Open the port.
 
         Args:
-            port: its number.
-            what: its use, for messages: "lidar: data packets".
+            port: port number.
+            what: use of the port, for messages: "lidar: data packets".
 
         Raises:
-            SourceError: another program has exclusive use of it, or permission is missing.
+            SourceError: another program uses the port exclusively, or permission is missing.
         """
         self.port = port
         self.n_overflowed = 0

@@ -51,7 +51,7 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
     folder = next(path for path in (folder, *folder.parents) if path.exists())
     try:
         free_mb = shutil.disk_usage(folder).free / 1e6
-        block = os.urandom(4 << 20)  # disks that compress are not fooled
+        block = os.urandom(4 << 20)  # random data: disks may compress
         n_bytes, start_s = 0, time.monotonic()
         with tempfile.TemporaryFile(dir=folder) as file:
             # At most half a second or 48 MiB, each block flushed like a capture's files.
@@ -90,7 +90,7 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
             what = what.removeprefix(start)
         yield findings.FAILED(what=what, hint=seen.failure.hint)
         return
-    assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
+    assert seen.status is not None  # sensors that neither open nor fail in time are reported as failed
     yield findings.ANSWERS(device=seen.status.device)
     yield from exam.problems(sensor, "device")
 
@@ -148,7 +148,7 @@ def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
 def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
     """Judge the rate of scans or images.
 
-    A LiDAR's rate is its rotor's speed, by its own clock: scans arrive late on a busy computer.
+    The LiDAR's rate is its rotor's speed, by its own clock: on a busy computer, scans arrive late.
     """
     rate_hz = 0.0 if seen.status is None else seen.status.rates_hz.get("scans", 0.0)
     if stream != "scans" or stream not in seen.arrivals_ns or rate_hz <= 0:
@@ -203,7 +203,7 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
         rate_hz, action = 0.0, "pps" if line == PPS_LINE else ""
         stamps_ns = [pulse.stamp_ns for pulse in board.pulses if pulse.sensor == line]
         if len(stamps_ns) > 1 and stamps_ns[-1] > stamps_ns[0]:
-            # By the board's clock; dropped lines count.
+            # Pulse rate by the board's clock, including pulses whose lines were lost.
             n_lost = board.status.n_lost_by_line.get(line, 0)
             rate_hz = 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
         figures: dict[str, Any] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
@@ -344,7 +344,7 @@ class Check:
 
     Attributes:
         subject: "computer", a sensor's name in the profile, or "rig" for several sensors together.
-        name: the item checked, in a word.
+        name: one word for the checked item.
         findings: findings of the check; those without a subject get the line's.
     """
 
@@ -370,8 +370,8 @@ class Check:
 def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path()) -> list[Check]:
     """Check the computer and every sensor of a rig.
 
-    An absent or failing sensor is an error, and everything else is still examined. Takes the duration, and
-    the time that the sensors take to open.
+    An absent or failing sensor is an error; everything else is still checked. The check lasts for the
+    duration and the time that sensors take to open.
 
     Args:
         rig: the profile.

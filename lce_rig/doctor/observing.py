@@ -33,7 +33,7 @@ class ObservedSensor:
         failure: the error if it could not be opened, or ended early.
         watched_s: time for which it was open.
         ended_ns: end of that time, by the computer's time of day.
-        arrivals_ns: of each scan, image or batch that has a timestamp, by "scans", "frames", "events".
+        arrivals_ns: arrival of each scan, image or batch with a timestamp, by "scans", "frames", "events".
         frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
         n_events: number of events.

@@ -40,7 +40,7 @@ NO_SESSION = Kind(
 )
 NO_IMAGES = Kind(
     "export.no_images",
-    "{format}: camera {subject} is left out: the session has no images of it",
+    "{format}: camera {subject} is skipped: the session has no images of it",
     severity="warning",
 )
 
@@ -52,10 +52,10 @@ class ExportJob:
     Attributes:
         calibrations: one for each camera and LiDAR.
         rig: the profile the calibrations belong to.
-        folder: for the files.
-        robot: the robot's own tree of frames; None where outputs hang from the profile's `mount` or root.
-        session: with the images and scans; None if only results are available.
-        findings: content that was left out of the outputs or put into another form, and why; grows.
+        folder: folder for the files.
+        robot: the robot's own tree of frames; None if outputs hang from the profile's `mount` or root.
+        session: source of images and scans; None if only results are available.
+        findings: content that the outputs omit or change, and why; grows.
     """
 
     calibrations: Sequence[Calibration]
@@ -103,7 +103,7 @@ class ExportJob:
 
         Args:
             content: content of the file.
-            calibrations: those in the file.
+            calibrations: calibrations in the file.
             of_one_camera: whether the file is for one camera; else the head names cameras that it lacks.
         """
         lines = [f"{content} of rig {self.rig.name}, written by {MADE_BY}"]
@@ -198,9 +198,9 @@ def write_exports(
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
         is_forced: write failed calibrations too; every file is then marked as failed.
-        session: with images and scans, for formats that show them.
+        session: source of images and scans, for formats that contain them.
         robot: the robot's own tree of frames, into which the outputs are to fit.
-        findings: gets those about content that is left out or in another form.
+        findings: receives those about omitted or changed content.
 
     Returns:
         The files in the order of the formats; those of a bag lie in a folder of their own.
@@ -258,7 +258,7 @@ def remove_exports(folder: Path) -> None:
     """Remove exports of earlier runs from a folder, recognised by their first lines.
 
     Raises:
-        SessionError: one cannot be removed.
+        SessionError: a file cannot be removed.
     """
     for path in sorted(folder.glob("*")):
         if is_export(path):
@@ -279,7 +279,7 @@ def is_export(path: Path) -> bool:
     """Check whether lce-rig wrote a file, by its first lines, or a bag, by its metadata.
 
     Raises:
-        SessionError: it cannot be read.
+        SessionError: the file cannot be read.
     """
     if path.is_symlink():
         return False

@@ -126,7 +126,7 @@ def read_reference(path: Path | str) -> Reference:
     """Read truth.json, result.json or any JSON with a 4x4 `T_cam_lidar`, at the top or in a list `pairs`.
 
     Raises:
-        SessionError: there is none, or it is not a rigid transform.
+        SessionError: the file has none, or it is not a rigid transform.
     """
     path = Path(path)
     with reading(path, SessionError, most_bytes=MAX_BYTES):

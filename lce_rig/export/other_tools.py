@@ -1,6 +1,6 @@
 """Formats of other tools: Kalibr, direct_visual_lidar_calibration, FAST-LIVO2, OpenCV and Autoware.
 
-A camera model with more coefficients than a format has is replaced by the best-fitting one that it has.
+A camera model with more coefficients than a format supports is replaced by the best-fitting supported one.
 
 Autoware's kit frame is `sensor_kit_base_link`. A LiDAR's entry there is the base of its housing, from which
 its description leads to the frame of the points; a camera's is its body, `NAME/camera_link`.
@@ -68,10 +68,10 @@ def lens_for(job: ExportJob, format_name: str, camera: str, model: str) -> tuple
     """Return a camera's model with the coefficients of a format; a refit is noted in file and finding.
 
     Args:
-        job: which gets the finding.
-        format_name: for it.
+        job: the export, which receives the finding.
+        format_name: name of the format, for the finding.
         camera: the camera's name.
-        model: that the format has room for, see `fit_lens`.
+        model: model that the format supports, see `fit_lens`.
 
     Returns:
         The model, and lines of the head.

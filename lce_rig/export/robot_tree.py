@@ -1,8 +1,8 @@
 """A robot's frame tree, and the changes to it that realise the calibrations.
 
 The tree comes from the profile's `mount`, from the robot's URDF, or from the static transforms of a
-recording. Without any of them the sensors make a tree of their own. All outputs with frames are made from
-`build_trees`.
+recording. Without any of them the sensors form a tree of their own. `build_trees` is the source of all
+outputs with frames.
 """
 
 from collections import Counter
@@ -25,10 +25,10 @@ class Joint(NamedTuple):
 
     Attributes:
         parent, child: the frames.
-        T_parent_child: (4, 4), the child's pose in the parent's frame; of a joint that moves, at zero.
+        T_parent_child: (4, 4), the child's pose in the parent's frame; for moving joints, at zero.
         is_fixed: whether it never moves.
-        name: in the robot's URDF; "" where joints have none.
-        is_given: whether the robot's own tree has it like this already.
+        name: name in the robot's URDF; "" if joints have none.
+        is_given: whether the robot's own tree already contains it unchanged.
     """
 
     parent: str
@@ -44,7 +44,7 @@ class JointChange(NamedTuple):
 
     Attributes:
         joint: the joint after the change.
-        before: T_parent_child (4, 4) of the robot's own; None for a new joint.
+        before: T_parent_child (4, 4) in the robot's own tree; None for a new joint.
     """
 
     joint: Joint
@@ -70,7 +70,7 @@ class RobotTree:
     Attributes:
         source: the file it was read from, for messages.
         frames: all frames.
-        above: the joint of each frame that has a parent; of trees to be written, parents first.
+        above: joint of each frame that has a parent; in trees to be written, parents first.
     """
 
     source: str
@@ -94,11 +94,11 @@ class RobotTree:
         """Build the tree of joints, and check its validity.
 
         Args:
-            source: for messages.
-            joints: in any order.
+            source: file, for messages.
+            joints: joints in any order.
             links: the frames, if the source lists them.
-            has_one_root: whether it has to be one tree; else several, as static transforms make where others
-                change while the robot drives.
+            has_one_root: whether it must be one tree. Static transforms may form several, connected by
+                transforms that change while the robot drives.
 
         Raises:
             SessionError: no frame, a name twice, an unknown frame, two parents, several roots, or a loop.
@@ -200,7 +200,8 @@ def fit_tree(
     profile's `mount` adds its sensor to a robot that lacks it.
 
     Args:
-        robot: its own tree; None for one of the sensors alone, under the profile's `mount` if it has one.
+        robot: tree of the robot; None for one of the sensors alone, below the profile's `mount` if it has
+            one.
         calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
 
@@ -251,7 +252,7 @@ def build_trees(
 
     Raises:
         LceRigError: a calibration names a sensor that the rig does not have.
-        SessionError: they do not fit into the robot's tree, see `fit_tree`.
+        SessionError: the sensors do not fit into the robot's tree, see `fit_tree`.
     """
     tree, changes, groups = fit_tree(robot, calibrations, rig)
     optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}

@@ -48,8 +48,8 @@ class _Topics:
 def export_tf_static_bag(job: ExportJob) -> list[Path]:
     """Write tf_static/, a ROS 2 bag with all transforms in one latched message; replace an earlier one.
 
-    It holds the robot's own transforms on the way to the sensors too, as no other program publishes while a
-    bag is played. The message is reliable and transient local, as tf2 wants it. metadata.yaml names lce-rig
+    The bag also holds the robot's own transforms between root and sensors, as no other program publishes them
+    during playback. The message is reliable and transient local, as tf2 requires. metadata.yaml names lce-rig
     as its writer.
 
     Raises:
@@ -64,7 +64,7 @@ def export_tf_static_bag(job: ExportJob) -> list[Path]:
 def export_mcap(job: ExportJob) -> list[Path]:
     """Write the bag RIG_session/: images, point clouds, camera models and transforms.
 
-    Beside the images lies the point cloud projected into each of them, as the result has it.
+    Besides the images, the bag holds images with the projected point cloud.
 
     Raises:
         SessionError: a capture is damaged, or the disk is full.

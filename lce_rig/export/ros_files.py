@@ -1,6 +1,6 @@
 """Files for ROS: camera_info, static transforms as commands for ROS 1 and ROS 2, and a ROS 2 launch file.
 
-Transforms that the robot's own tree has already are left to the robot.
+Transforms that the robot's own tree already has are not repeated.
 """
 
 import shlex

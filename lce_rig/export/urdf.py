@@ -162,16 +162,17 @@ def write_into_urdf(
     """Replace or add the joints of calibrated sensors in a robot's URDF; a backup of it is kept.
 
     Args:
-        path: the robot's URDF; of a link, the file that it leads to is replaced in one step.
+        path: the robot's URDF, replaced in one step; for a link, the file that it leads to.
         calibrations: calibrations of the rig's sensors.
         rig: the profile, which names the frames.
-        now: names the backup, path.urdf.2026-11-22T101500.bak.
+        now: time in the backup's name, path.urdf.2026-11-22T101500.bak.
 
     Returns:
         The file with the earlier text, None if nothing had to change, and the joints that are new or moved.
 
     Raises:
-        SessionError: it is not a URDF, does not fit (`fit_tree`), or cannot be written; it is unchanged.
+        SessionError: the file is not a URDF, does not fit (`fit_tree`), or cannot be written. It is
+            unchanged.
     """
     before = _read(path)
     tree = _parse(path, before)

@@ -1,6 +1,6 @@
 """Deploy a result to a target, query its state, and restore an earlier release.
 
-`plan` lists changes and objections, `deploy` makes the changes, `standing` asks for the state, `rollback`
+`plan` lists changes and objections, `deploy` makes the changes, `standing` queries the state, `rollback`
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
@@ -74,7 +74,7 @@ class SensorChange:
         camera, lidar: the sensors.
         is_new: whether the new set has extrinsics of them.
         rotation_deg, translation_m: between both sets; None if only one of them has extrinsics.
-        verdict, verdict_there: of the new and the deployed result, or "".
+        verdict, verdict_there: verdicts of the new and the deployed result, or "".
     """
 
     camera: str
@@ -127,12 +127,12 @@ class Deployed:
     """The outcome of a deployment or a rollback.
 
     Attributes:
-        release: that is current now.
+        release: the current release.
         replaces: the release that was current before; "" for the first.
-        is_new: whether something changed; False if these very files were in place already.
+        is_new: whether something changed; False if the same files were already in place.
         output: output of the command that ran afterwards; None if none ran.
-        changed_there: files of the earlier release that were not as they were deployed.
-        remarks: as in `Plan`.
+        changed_there: files of the earlier release that had been changed at the target.
+        remarks: see `Plan`.
     """
 
     release: ReleaseRecord
@@ -172,16 +172,16 @@ def deploy(
 ) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
-    If these very files are in place, only a command that has not succeeded yet runs. After any interruption
-    the target holds the earlier set or the new one.
+    If the same files are already in place, only a command that has not succeeded yet runs. After any
+    interruption the target holds the earlier set or the new one.
 
     Args:
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
         session: with images and scans, for formats that show them.
-        reason: for deploying it against objections; it is written down there.
-        place: another way to the target's folder than the target's own.
+        reason: reason for deploying against objections; it is logged at the target.
+        place: replaces the target's own access to its folder.
         announce: receives the changes before anything is refused or changed.
 
     Raises:
@@ -231,7 +231,7 @@ def standing(target: TargetSettings) -> TargetState:
     """Query the state of a target, and whether its current files are unchanged since deployment.
 
     Raises:
-        TargetError: it cannot be reached or read.
+        TargetError: the target cannot be reached or read.
     """
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         return _standing(Place(target), Path(folder) / "deployed")
@@ -250,12 +250,12 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     """Make an earlier release current again, byte for byte, and run the target's command.
 
     Args:
-        target: where.
+        target: the target.
         name: name of the release; None takes the one that the current release replaced.
-        reason: written down there.
+        reason: reason to log at the target.
 
     Raises:
-        TargetError: there is none, its files are not as they were deployed, or the target cannot be reached.
+        TargetError: there is no such release, its files were changed, or the target cannot be reached.
         CommandError: the command failed; the earlier files are in place.
     """
     place = Place(target)
@@ -394,7 +394,7 @@ def _commit(
     """Make a release current.
 
     Raises:
-        TargetError: another one has become current since, or the target cannot be written or reached.
+        TargetError: another release has become current meanwhile, or the target cannot be written or reached.
     """
     entry = {
         "time": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
@@ -431,7 +431,7 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     """Run the target's command; return its output, or None without a command.
 
     Raises:
-        CommandError: it failed, or its outcome is unknown; the files are in place.
+        CommandError: the command failed, or its outcome is unknown; the files are in place.
     """
     if target.run is None:
         return None

@@ -79,7 +79,7 @@ DEPLOY_OTHER_RIG = Kind(
 DEPLOY_MOVED = Kind(
     "deploy.moved",
     "{subject} would move by {rotation_deg:deg}, {translation_m:mm} (limit {limit_deg:deg}, {limit_m:mm})",
-    "Check the result, `lce-rig verify {session}`, or force it and say why.",
+    "Check the result, `lce-rig verify {session}`, or force it with a reason.",
 )
 DEPLOY_WORSE = Kind(
     "deploy.worse",
@@ -89,12 +89,12 @@ DEPLOY_WORSE = Kind(
 DEPLOY_OTHER_SERIAL = Kind(
     "deploy.other_serial",
     "{subject} has serial number {serial}, the deployed one {there}",
-    "Name the right target. If the sensor was replaced, force it and say so.",
+    "Name the right target. For a replaced sensor, force it with a reason.",
 )
 DEPLOY_OLDER = Kind(
     "deploy.older",
     "the result's captures are of {date}, the deployed ones of {there}",
-    "To go back: `lce-rig deploy {session} --target TARGET --rollback`",
+    "To roll back: `lce-rig deploy {session} --target TARGET --rollback`",
 )
 DEPLOY_UNDATED = Kind(
     "deploy.undated",

@@ -84,7 +84,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 
     Raises:
         UsageError: the manifest cannot be used.
-        ProfileError: it names a profile that does not exist.
+        ProfileError: the manifest names a profile that does not exist.
         NotEnoughDataError: there is nothing to run.
     """
     if not root.exists():

@@ -4,15 +4,16 @@ A target is a folder:
 
     current -> releases/20261123T021501Z-ab12cd34      read by robot software
     releases/20261123T021501Z-ab12cd34/                a set of files, never changed, and its record RECORD
-    deployments.log                                    one JSON object a line, for people
+    deployments.log                                    one JSON object per line, for people
     .pending                                           the release whose command has not succeeded yet
 
 A set is written into a release of its own and becomes current by one rename of the link. An interruption
 leaves `current` on the earlier set or the new one. Nothing is removed before that rename, and afterwards only
 releases: folders named as above, with a record.
 
-All steps at the target are POSIX shell, the same for both kinds of target. Names and texts are arguments of
-the scripts, never part of them. `current` and `releases` that lce-rig has not made are refused untouched.
+All steps at the target are POSIX shell scripts, the same for both kinds of target. Names and texts are
+arguments of the scripts, never part of them. `current` and `releases` not created by lce-rig are refused and
+left unchanged.
 """
 
 import os
@@ -228,7 +229,7 @@ def run_bounded(words: Sequence[str], timeout_s: float, content: bytes = b"") ->
     Args:
         words: the program and its arguments; no shell reads them.
         timeout_s: time limit.
-        content: its standard input.
+        content: standard input of the program.
 
     Raises:
         OSError: the program cannot be started.
@@ -275,8 +276,8 @@ class Place:
     """A target's folder, local or remote; no connection is kept between calls.
 
     Attributes:
-        path: path of the folder, there.
-        label: the target in words.
+        path: path of the folder at the target.
+        label: description of the target.
     """
 
     def __init__(self, target: TargetSettings) -> None:
@@ -305,16 +306,16 @@ class Place:
         """Run a script at the place and return its output; raise if it fails.
 
         Raises:
-            LostError: as in `run`.
-            TargetError: it failed.
+            LostError: see `run`.
+            TargetError: the script failed.
         """
         return self.check(self.run(script, *arguments, content=content)).out
 
     def check(self, ran: Ran) -> Ran:
-        """Pass on a script's outcome.
+        """Return a script's outcome if it succeeded.
 
         Raises:
-            TargetError: it failed.
+            TargetError: the script failed.
         """
         if ran.code:
             hint = _HINTS.get(ran.code, "Check space and permissions there.")
@@ -325,7 +326,7 @@ class Place:
         """Copy the content of a local folder into an existing folder at the place.
 
         Raises:
-            TargetError: it cannot be reached or written; part of it may be there.
+            TargetError: the target cannot be reached or written; a part may have been copied.
         """
         if self._host is None:
             self._copy(folder, Path(self.path) / name)
@@ -340,7 +341,7 @@ class Place:
             The first of its entries that are not plain files, or too large; then nothing is copied.
 
         Raises:
-            TargetError: it cannot be reached or read.
+            TargetError: the target cannot be reached or read.
         """
         odd = [line.removeprefix("./") for line in self.must_run(_ODD, name).splitlines() if line[:1] == "."]
         if odd:
@@ -380,7 +381,7 @@ class Place:
         if ran.code == _LOST:
             raise LostError(
                 f"{self.label}: no connection: {_last_line(ran.err)}",
-                "Check that `ssh` reaches it without a question, with the same options (port, key, host).",
+                "Check that `ssh` reaches it without a prompt, with the same options (port, key, host).",
             )
         return ran
 

@@ -76,7 +76,7 @@ SCHEMA = pa.schema([pa.field(name, kind) for name, kind in _TYPES.items()])
 COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
 
 _WRITE_AGAIN = "`lce-rig fleet table --registry FOLDER --rebuild` writes it again."
-# Rows per group with minimum and maximum, by which queries skip groups.
+# Rows per group; queries skip groups by their minimum and maximum.
 _ROWS_PER_GROUP = 1 << 16
 # Poses and covariances, most of the bytes, do not compress, so the fastest to read wins.
 _COMPRESSION = "lz4"
@@ -86,7 +86,7 @@ def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mappi
     """Add the columns `PAIR` of each result to its row; figures that are not finite are null.
 
     Args:
-        rows: of one session, as in `ROWS`: one with status "ok" for all results, and one for each camera and
+        rows: rows of one session: one with status "ok" for all results, and one for each camera and
             LiDAR without a result.
         pairs: the results.
         serials: serial numbers by sensor.
@@ -154,7 +154,7 @@ def read_table(place: Path | str | Storage, columns: Sequence[str] | None = None
 
     Args:
         place: path or address of its file.
-        columns: the names of those to read; None for all.
+        columns: names of the columns to read; None for all.
 
     Raises:
             SessionError: the file is missing, or not such a table.
@@ -208,7 +208,7 @@ class Registry:
     """Results of many sessions.
 
     Attributes:
-        place: its folder.
+        place: folder of the registry.
     """
 
     place: Storage
@@ -225,7 +225,7 @@ class Registry:
             folder: "robot/date-hash".
 
         Raises:
-            SessionError: it cannot be written; an earlier result stays.
+            SessionError: the folder cannot be written; an earlier result stays.
         """
         root = self.place.local
         try:
@@ -260,7 +260,7 @@ class Registry:
         """Move a result below `SUPERSEDED`, outside the table; add a number if the name exists.
 
         Raises:
-            SessionError: it cannot be written; the result stays.
+            SessionError: the folder cannot be written; the result stays.
         """
         endings = chain([""], (f"-{n}" for n in count(2)))
         targets = (self.place / f"{SUPERSEDED}/{folder}{ending}" for ending in endings)
@@ -310,7 +310,7 @@ class Registry:
         """Read the table, or some of its rows, as a `pyarrow.Table`.
 
         Args:
-            columns: their names; None for all.
+            columns: names of the columns; None for all.
             where: condition in SQL, such as "verdict = 'fail' and date > '2026-01-01'" or
                 "list_contains(findings, 'verdict.moved')"; "" for all rows.
 
@@ -337,7 +337,7 @@ class Registry:
         results of one source the later one stays; the other's folder is moved below `SUPERSEDED`.
 
         Args:
-            fresh: rows written since the table was; they replace those of the same folder.
+            fresh: rows newer than the table; they replace those of the same folder.
             rebuild: read every folder, as if there were no table.
 
         Returns:

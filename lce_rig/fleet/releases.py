@@ -49,13 +49,13 @@ def find_target(name: str, file: Path | None, session: Path, robot: str | None =
 
     Args:
         name: name of the target.
-        file: that lists targets; None for deploy.yaml beside the session.
-        session: its folder.
-        robot: for a target that stands for many.
+        file: file that lists targets; None for deploy.yaml beside the session.
+        session: folder of the session.
+        robot: the robot, for a target shared by several.
 
     Raises:
         ProfileError: the file is invalid.
-        UsageError: the target is unknown, or it stands for many robots.
+        UsageError: the target is unknown, or is shared by several robots and none is named.
     """
     place = file or session.resolve().parent / TARGETS_FILE
     targets = read_targets(place) if file is not None or place.is_file() else {}
@@ -75,7 +75,7 @@ class ReleaseRecord(BaseModel):
 
     Attributes:
         format_version: format version of this schema.
-        name: name of the release: time of deployment, UTC, and the begin of `set_sha256`.
+        name: name of the release: UTC time of deployment, and the beginning of `set_sha256`.
         time: time of deployment, by the clock of the computer that deployed it.
         by: user@computer that deployed it.
         made_by: the program that wrote the files.
@@ -83,8 +83,8 @@ class ReleaseRecord(BaseModel):
         reason: reason of a forced deployment; "" if it was not forced.
         forced: codes of the objections.
         files: SHA-256 of each file by its path.
-        robot, serials, date, session_sha256: as in the result's provenance.
-        verdicts: by camera and LiDAR.
+        robot, serials, date, session_sha256: from the result's provenance.
+        verdicts: verdicts by camera and LiDAR.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
@@ -147,10 +147,10 @@ class TargetState:
     """The state of a target.
 
     Attributes:
-        current: read by robot software; None before the first deployment.
-        releases: all that are kept, the newest first.
+        current: release read by robot software; None before the first deployment.
+        releases: all kept releases, newest first.
         pending: the release whose command has not succeeded yet, or "".
-        changed: current files that differ from the deployed ones, and how they differ; empty if not asked.
+        changed: current files that differ from the deployed ones, and how they differ; empty if not checked.
     """
 
     current: ReleaseRecord | None = None
@@ -172,7 +172,7 @@ def read_state(place: Place) -> TargetState:
     """Query the state of a target, without changing it.
 
     Raises:
-        TargetError: it cannot be reached, or `current` or `releases` are not those of lce-rig.
+        TargetError: the target cannot be reached, or `current` or `releases` is not by lce-rig.
     """
     current, pending, releases = "", "", []
     for line in place.must_run(STATE).splitlines():
@@ -196,7 +196,7 @@ def read_state(place: Place) -> TargetState:
     if state.named(current) is None:
         raise TargetError(
             f"{place.label}: the record of the current release {current} is damaged",
-            f"Remove the link {place.path}/current there to begin anew.",
+            f"Remove the link {place.path}/current there to start again.",
         )
     return TargetState(state.named(current), state.releases, pending)
 
@@ -205,7 +205,7 @@ def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
     """Copy a release to a new local folder.
 
     Returns:
-        Its files that are not as they were deployed: "changed", "missing", "added" or "no plain file" by
+        The files that differ from those deployed: "changed", "missing", "added" or "no plain file" by
         path. With links, devices or very large files among them nothing is copied.
 
     Raises:

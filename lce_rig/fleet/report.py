@@ -158,7 +158,7 @@ class FleetReport:
         n_rows: number of rows of its table.
         history: results compared in time.
         findings: robots that moved.
-        verdicts: (verdict, or status of a session without result), rows and robots, the most rows first.
+        verdicts: (verdict, or status without a result), numbers of rows and robots; most rows first.
         causes: (severity, code) of missing, failed and marginal results, rows and robots, likewise.
     """
 

@@ -1,6 +1,6 @@
 """Deploy the newest results of many robots, one robot after the other, until the first failure.
 
-Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
+A roll-out stores no state: robots that hold their newest result are not written again, so the same call
 continues after an interrupt.
 """
 
@@ -61,7 +61,7 @@ class Rollout:
     Attributes:
         target: name of the target.
         stopped_by: the robot that failed and stopped it; "" if none did.
-        robots: by name.
+        robots: state of each robot, by name.
     """
 
     target: str
@@ -114,10 +114,10 @@ def roll_out(
     Robots that hold their result are not written again. Skipped robots stay unchanged.
 
     Args:
-        registry: with the results.
+        registry: registry of the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
-        file: that lists targets.
-        wanted: from `newest_results`.
+        file: file that lists targets.
+        wanted: results from `newest_results`.
         progress: called with (done, total) robots.
 
     Raises:

@@ -33,7 +33,7 @@ class FleetRun:
         n_new: sessions that were run.
         n_held: sessions whose results the registry held.
         statuses: number of sessions by status, held ones included.
-        causes: how many sessions have no result, by the code of the cause.
+        causes: number of sessions without a result, by the code of the cause.
         table: the table, a `pyarrow.Table`.
     """
 
@@ -61,8 +61,8 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
 
     Args:
         workers: processes of one thread each; of a running cluster, its own count.
-        memory_limit_mb: memory limit of each, beside that of its sessions.
-        scheduler: address of a running one, tcp://...
+        memory_limit_mb: memory limit of each worker, besides that of its sessions.
+        scheduler: address of a running scheduler, tcp://...
 
     Raises:
         SourceError: the scheduler does not answer.
@@ -107,7 +107,7 @@ def run_fleet(
 ) -> FleetRun:
     """Run the sessions without a result in the registry, and update its table.
 
-    An interrupt, or the loss of workers, loses nothing that was written: run it again to continue.
+    Results are kept after an interrupt or the loss of workers: run it again to continue.
 
     Args:
         jobs: the sessions.

@@ -25,7 +25,7 @@ class Storage:
     reports: missing credentials, no network, no permission.
 
     Attributes:
-        url: absolute; without a slash at its end.
+        url: absolute address, without a trailing slash.
     """
 
     url: str
@@ -40,7 +40,7 @@ class Storage:
         """Return this place if it can be a folder of results.
 
         Raises:
-            UsageError: it is a file or a device, an archive, or of an unknown kind.
+            UsageError: the place is a file, a device, an archive, or of an unknown kind.
         """
         if self.local is None:
             try:
@@ -177,7 +177,7 @@ class Storage:
             without: names in the folder that are skipped.
 
         Raises:
-            OSError: it is not there, or cannot be written here.
+            OSError: the source is missing, or the copy cannot be written.
         """
         if self.local is not None:
             if not self.local.is_dir():

@@ -49,7 +49,7 @@ class TargetSettings(Settings):
         robot: the robot there; results of another one are refused.
         formats: export formats; None for the profile's `exports`, else the usual ones.
         run: a command to run there afterwards, by sh; $1 is the robot's name.
-        run_timeout_s: time that it may take.
+        run_timeout_s: time limit of that command.
         ssh: options of ssh_config for the connection, such as Port and IdentityFile.
         keep: number of releases kept, the current one included.
     """
@@ -85,7 +85,7 @@ class TargetSettings(Settings):
         """Insert a robot's name for {robot}; results of other robots are then refused.
 
         Raises:
-            ValueError: no robot can have this name.
+            ValueError: the robot's name is invalid.
         """
         values = {"to": self.to.replace(ROBOT_FIELD, robot), "robot": self.robot or robot}
         return TargetSettings.model_validate(self.model_dump() | values)

@@ -144,8 +144,8 @@ def _open(job: Job, scratch: Path) -> tuple[Rig, Session | None, Provenance]:
     """Copy a session or recording to a local folder.
 
     Returns:
-        The profile; the session, None for a recording; its origin, of a recording the robot that the profile
-        names and the fingerprint of files and profile.
+        The profile; the session, None for a recording; and its origin: for a recording, the profile's robot
+        and the fingerprint of files and profile.
     """
     source, copy = Storage.at(job.source), scratch / "session"
     rig = None
@@ -229,9 +229,9 @@ def publish(
     """Write a result's folder and return its rows.
 
     Args:
-        registry: where.
+        registry: the destination.
         rows: rows of one folder, as `with_pairs` describes them.
-        start_s: begin of the work, on the monotonic clock.
+        start_s: start of the work, on the monotonic clock.
         fill: writes the other files into the folder.
         saved: the result of the session; None if it has none.
     """
@@ -252,8 +252,8 @@ _DETAIL_BYTES = 2000
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )
-# OpenCV has an error of its own for it, C++ one that Python does not know; Rust (pydantic) and the C library
-# end the process with a line.
+# Signs of exhausted memory on stderr: OpenCV and C++ raise errors of their own; Rust (pydantic) and the C
+# library print a line and end the process.
 _WITHOUT_MEMORY = (
     "MemoryError",
     "Insufficient memory",
@@ -269,10 +269,10 @@ class Ended(NamedTuple):
     """How a session's process ended.
 
     Attributes:
-        rows: its return value; None if it ended before.
-        known: the last row that it sent before it ended.
-        status: "ok" with rows.
-        cause: why there are none.
+        rows: its return value; None if it ended early.
+        known: the last row that it sent early.
+        status: "ok" if it returned rows.
+        cause: the failure; None if it returned rows.
     """
 
     rows: list[Row] | None
@@ -285,9 +285,9 @@ def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memo
     """Run a function in a separate process and wait for its end.
 
     Args:
-        call: "module:function"; it gets the arguments, and a function that sends a row early.
+        call: "module:function"; called with the arguments, and a function that sends a row early.
         arguments: JSON values.
-        time_limit_s: after which the process is ended.
+        time_limit_s: time limit, after which the process is killed.
         memory_limit_mb: memory limit of data, beyond which its allocations fail.
     """
     order = {"call": call, "arguments": dict(arguments), "memory_limit_mb": memory_limit_mb}

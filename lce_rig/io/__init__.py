@@ -48,7 +48,7 @@ def recognise(path: Path) -> str:
     """Return the kind of a recording, a key of `RECORDINGS`; a folder with a bag counts as a bag.
 
     Raises:
-        SourceError: nothing is there, or no recording.
+        SourceError: the path is missing, or not a recording.
     """
     if not path.exists():
         raise SourceError(f"{path} does not exist")
@@ -56,7 +56,7 @@ def recognise(path: Path) -> str:
         kind = kind_of(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
-        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
+        hint = f"Give a folder with img/ and pcd/, a bag, or an event file ({known})."
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     return kind
 
@@ -72,7 +72,7 @@ def open_recordings(
         options: one for all recordings, or one per path.
 
     Raises:
-        SourceError: as `open_recording`; for a folder only if none of its files can be read.
+        SourceError: see `open_recording`; for a folder, only if none of its files can be read.
     """
     paths, options = list(paths), options or SourceOptions()
     by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options
@@ -101,9 +101,9 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     or a camera of the profile belongs to it.
 
     Args:
-        path: a folder, such as `lce-rig collect --record` fills, or any recording.
+        path: a folder, such as one of `lce-rig collect --record`, or any recording.
         rig: the profile.
-        options: for reading, unless file names choose the sensor.
+        options: options for reading, unless file names choose the sensor.
     """
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return [(path, options)]

@@ -74,7 +74,7 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
         settings: settings of the LiDAR.
 
     Returns:
-        Beams of another model, with those that fit; rings or points that are missing regularly.
+        Findings about beams of another model, with those that fit; and regularly missing rings or points.
     """
     rings, n_returns = np.unique(scan.ring, return_counts=True)
     is_seen = n_returns >= _MIN_RETURNS
@@ -114,7 +114,7 @@ def compare_beams(scan: Scan, settings: LidarSettings) -> list[Finding]:
 def _compare_steps(scan: Scan, settings: LidarSettings) -> list[Finding]:
     """Compare the median azimuth step of a scan's rings with the model's.
 
-    Where the number of rings has no factor in common with k, every k-th point is of each ring in turn.
+    If the number of rings and k have no common factor, every k-th point is from each ring in turn.
     """
     sheet = settings.data_sheet()
     if sheet is None or (find_data_sheet(settings.model) is None and settings.columns is None):
@@ -172,8 +172,8 @@ def _distance_deg(elevations_deg: Array, sheet: DataSheet) -> float:
 def _rings_in_sectors(scan: Scan, of_ring: NDArray[np.intp]) -> tuple[int, bool]:
     """Return the median number of rings per sector, and whether rings in between are missing.
 
-    Lasers fire in the order of the rings, or by turns in the lower and the upper half. Of every k-th point, a
-    sector then has each k-th ring, or one half of the rings.
+    Lasers fire in the order of the rings, or alternately in the lower and the upper half. With every k-th
+    point only, a sector then has every k-th ring, or one half of the rings.
 
     Args:
         scan: one revolution.

@@ -59,8 +59,8 @@ class CameraDescription:
 
     Attributes:
         K: (3, 3) px, at the full size.
-        distortion: its coefficients.
-        model: name of the distortion model, as `Intrinsics.from_ros` takes it.
+        distortion: coefficients of the distortion.
+        model: name of the distortion model, see `Intrinsics.from_ros`.
         size_px: (width, height) to which K belongs; zeros if not stated.
         P: (3, 4) px, of rectified images; zeros if not stated.
         turned_deg: angle by which rectification rotates the camera's frame.
@@ -92,7 +92,7 @@ class CameraDescription:
             is_rectified: whether their distortion has been removed.
 
         Raises:
-            ValueError: it is not calibrated, of a model that cannot be used, or of images of another size.
+            ValueError: the camera is not calibrated, of an unusable model, or of images of another size.
         """
         K, distortion, model, notes = self.K, self.distortion, self.model, list[str]()
         if is_rectified and self.P.any():
@@ -201,7 +201,7 @@ class CameraFile:
 
     Attributes:
         path: the file.
-        cameras: at least one.
+        cameras: at least one description.
     """
 
     path: Path
@@ -222,7 +222,7 @@ class CameraFile:
 
         Raises:
             UsageError: there are several cameras, and none of this name or topic.
-            ProfileError: it cannot be used, or belongs to images of another size.
+            ProfileError: the description cannot be used, or belongs to images of another size.
         """
         chosen = list(self.cameras)
         if len(chosen) > 1:
@@ -245,7 +245,7 @@ def read_cameras(path: Path) -> CameraFile:
     """Read a file that describes cameras, in any of `FORMS`.
 
     Raises:
-        ProfileError: it cannot be read, or describes no camera.
+        ProfileError: the file cannot be read, or describes no camera.
     """
     with reading(path, ProfileError, f"Give {FORMS}.", _MAX_BYTES):
         data = path.read_bytes()
@@ -299,7 +299,7 @@ def _parse_ini(text: str) -> dict[str, Any]:
             values.setdefault(name, []).extend(numbers)
     if len(values.get("distortion", ())) == 4:
         what = "it has 4 coefficients and names no model"
-        raise ValueError(f"{what}: give the ost.yaml beside it, which says plumb_bob or equidistant")
+        raise ValueError(f"{what}: give the ost.yaml beside it, which names plumb_bob or equidistant")
     flat = {key: numbers[0] if len(numbers) == 1 else numbers for key, numbers in values.items()}
     return {
         **flat,
@@ -313,7 +313,7 @@ def _describe(data: Any, name: str = "", depth: int = 0) -> Iterator[CameraDescr
     """Find the descriptions in plain mappings, which may be nested.
 
     Args:
-        data: as a parser of YAML returns it.
+        data: parsed YAML.
         name: key of the mapping.
         depth: nesting depth of the mapping.
 
@@ -359,7 +359,7 @@ def _one_camera(flat: Mapping[str, Any], K: Array, side: str, name: str) -> Came
     if coefficients is None and side:
         coefficients = _first_numbers(flat, [side + key for key in _COEFFICIENTS])
     if coefficients is None and "camfx" not in flat:
-        raise ValueError("it has a camera matrix, and no distortion_coefficients")
+        raise ValueError("it has a camera matrix, but no distortion_coefficients")
     if coefficients is None:
         # FAST-LIVO2 has a key for each.
         singles = (flat.get(key) for key in chain(*((f"camd{k}", f"k{k + 1}") for k in range(5))))

@@ -28,8 +28,8 @@ _MOST_RINGS = 1024
 # A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
 _MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
 _NO_RINGS_HINT = (
-    "Of a LiDAR that scans in no rings (Livox, solid state), name the model in the profile, or `model: "
-    "unstructured`. Of a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
+    "For a LiDAR without rings (Livox, solid state), name the model in the profile, or set `model: "
+    "unstructured`. For a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
 )
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
@@ -226,8 +226,8 @@ def to_scan(
 def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
     """Check which Livox tags (N,) mark a return as noise with high or moderate confidence.
 
-    Bits 0-1 judge by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the Mid-360
-    and the HAP on they mark returns between near objects: those that bleed over an edge.
+    Bits 0-1 classify by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the
+    Mid-360 and the HAP on they mark returns between near objects: points that bleed over an edge.
 
     References:
         Livox Wiki, point cloud characteristics: tag information.

@@ -48,7 +48,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     """Decode a PNG, JPEG or other image file held in memory.
 
     Raises:
-        ValueError: the data are damaged or not an image; the text has the reason.
+        ValueError: the data are damaged or not an image; the text states the reason.
     """
     import cv2
 
@@ -91,8 +91,8 @@ def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 def decode_ply(data: bytes) -> NDArray[Any]:
     """Decode the vertices of a PLY file: their scalar properties.
 
-    Open3D's reader is not used: it drops rings of 16 bits, gives wrong coordinates where their types differ,
-    and fills up a torn file with zeros.
+    Open3D's reader is not used: it drops rings of 16 bits, gives wrong coordinates if their types differ,
+    and pads torn files with zeros.
 
     Args:
         data: the file's bytes.
@@ -101,7 +101,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
         Structured (N,) with the vertices' properties.
 
     Raises:
-        ValueError: it is damaged, or of an unknown kind.
+        ValueError: the file is damaged, or of an unknown kind.
 
     References:
         http://paulbourke.net/dataformats/ply/
@@ -167,7 +167,7 @@ def _check_las(data: bytes) -> None:
     """Compare the counts in a header with the size of the file; laspy loops over them.
 
     Raises:
-        ValueError: the file is smaller than its header promises.
+        ValueError: the file is smaller than its header states.
 
     References:
         ASPRS, LAS specification 1.4-R15, table 3.

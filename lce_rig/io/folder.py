@@ -69,9 +69,9 @@ def pair_names(
 ) -> tuple[Pairs, str]:
     """Match images, or another LiDAR's point clouds, with point clouds by name (without suffix).
 
-    Equal names are used if nine in ten match; else the nearest time, if names are times and nine in ten find
-    a partner within the tolerance; else sorted order, if images and point clouds are equal in number; else
-    the better of the first two.
+    Equal names are paired if nine in ten match; else the nearest times, if names are times and nine in ten
+    find a partner within the tolerance; else sorted order, if images and point clouds are equal in number;
+    else the better of the first two.
 
     Args:
         images, clouds: names in natural order.
@@ -79,7 +79,7 @@ def pair_names(
         may_count: whether sorted order is allowed.
 
     Returns:
-        The pairs, and how they were found, in words.
+        The pairs, and the method in words.
 
     Raises:
         SourceError: no name matches.
@@ -164,7 +164,7 @@ def _list(
     """List the files of one kind in the folder named for it, else in the only folder with such files.
 
     Raises:
-        SourceError: there are none, or several folders have some and none is named for them.
+        SourceError: there are no files, or several folders have some and none is named after the sensor.
     """
     folders = _folders(folder)
     holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
@@ -203,9 +203,9 @@ class FileOnDisk:
     """An image or point cloud not read yet; the timestamp comes from its name.
 
     Attributes:
-        label: its name, for messages; with its folder's where several sensors may have the same names.
-        sensor, channel: that it belongs to; a LiDAR has no channel.
-        settings: settings of the LiDAR; None of an image.
+        label: name of the file, for messages; with its folder's if several sensors may have equal names.
+        sensor, channel: those that it belongs to; a LiDAR has no channel.
+        settings: settings of the LiDAR; None for an image.
     """
 
     path: Path
@@ -219,7 +219,7 @@ class FileOnDisk:
         """Decode an image.
 
         Raises:
-            SourceError: it is missing, empty, truncated or damaged.
+            SourceError: the file is missing, empty, truncated or damaged.
         """
         with reading(self.path, most_bytes=MAX_BYTES), decoding():
             data = self.path.read_bytes()
@@ -256,7 +256,7 @@ class PlacementOnDisk:
         """Decode all files; also return notes on assumptions and skipped points.
 
         Raises:
-            SourceError: one is missing, empty, truncated or damaged.
+            SourceError: a file is missing, empty, truncated or damaged.
         """
         notes = set[str]()
         images = tuple(file.image() for file in self.files if file.settings is None)
@@ -280,7 +280,7 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     """List the images of each camera.
 
     Raises:
-        SourceError: there are none, or none of the requested camera, or their camera is not known.
+        SourceError: there are no images, or none of the requested camera, or their camera is unknown.
     """
     found = _by_sensor(folder, rig.cameras, IMAGE_FOLDERS, SUFFIXES) if len(rig.cameras) > 1 else {}
     if options.camera in found:
@@ -302,7 +302,7 @@ def _clouds(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     """List the point clouds of the LiDAR, or of each LiDAR of a rig without cameras.
 
     Raises:
-        SourceError: there are none; or LAS files, whose reader is not installed.
+        SourceError: there are no point clouds, or LAS files without an installed reader.
     """
     suffixes = frozenset(DECODERS)
     if rig.cameras:
@@ -340,7 +340,7 @@ def read_pairs(
         progress: called with (done, total).
 
     Raises:
-        SourceError: not one could be read; the cause of the first.
+        SourceError: no pair could be read; the cause is that of the first.
     """
     failures: list[SourceError] = []
     for done, files in enumerate(pairs, start=1):
@@ -371,7 +371,7 @@ class ImagesRecording:
         """Find the images without decoding them.
 
         Raises:
-            SourceError: there are none, their camera is not known, or their names are not timestamps.
+            SourceError: there are no images, their camera is unknown, or their names are not timestamps.
         """
         self.path = path
         self.notes: list[str] = []
@@ -401,7 +401,7 @@ class ImagesRecording:
         """Yield the images in order of time; unreadable ones are counted in `notes`.
 
         Raises:
-            SourceError: not one could be read.
+            SourceError: no image could be read.
         """
         losses, n_read = Losses(), 0
         try:

@@ -40,7 +40,7 @@ class Datagram:
         host_ns: arrival at the host; 0 where unknown.
         source: IP address of the sender.
         source_port, port: UDP ports it was sent from and to.
-        payload: its content.
+        payload: content of the datagram.
     """
 
     host_ns: int
@@ -55,7 +55,7 @@ class PcapFile:
 
     Attributes:
         path: the file.
-        losses: datagrams that are not whole; grows while the file is read.
+        losses: incomplete datagrams; grows while the file is read.
         damage: the reason if the file could not be read to its end, else "".
     """
 
@@ -63,18 +63,18 @@ class PcapFile:
         """Check the format and the type of the recorded link.
 
         Raises:
-            SourceError: not a recording of a network, or of a link that is not read.
+            SourceError: not a network recording, or one of an unsupported link type.
         """
         self.path = path
         self.losses = Losses()
         self.damage = ""
         if not path.is_file():
             raise SourceError(f"{path}: not a file")
-        hint = "Record the card that the LiDAR is on (tcpdump -i eth0 -w FILE); unpack a packed file first."
+        hint = "Record the LiDAR's network interface (tcpdump -i eth0 -w FILE); decompress the file first."
         with reading(path, hint=hint), BoundedPath(path).open("rb") as file:
             self._link = dpkt.pcap.UniversalReader(file).datalink()
             if self._link not in _FRAMES:
-                raise ValueError(f"recorded from a link of type {self._link}, which is not read")
+                raise ValueError(f"recorded from a link of type {self._link}, which is not supported")
 
     def datagrams(self) -> Iterator[Datagram]:
         """Yield the whole UDP datagrams in the order of recording, up to where the file is damaged."""
@@ -101,10 +101,10 @@ class PcapFile:
             explain: returns the reason for a datagram that is not from the LiDAR; "" for one that is.
             what: description of the LiDAR, for messages.
             lidar: the LiDAR's name in the profile.
-            driver: its `driver` there.
+            driver: its `driver` block in the profile.
 
         Raises:
-            SourceError: there is none, or there are several of which none has the profile's address.
+            SourceError: no sender, or several of which none has the profile's address.
         """
         senders, others = Counter[tuple[str, int]](), Counter[str]()
         for n, datagram in enumerate(self.datagrams()):

@@ -70,7 +70,7 @@ class OusterMetadata:
         name: name of its profile.
         n_columns: columns of a revolution.
         columns_per_packet: columns of one packet.
-        altitude_rad, azimuth_rad: (L,) of each beam, from the top.
+        altitude_rad, azimuth_rad: (L,) angles of each beam, from the top.
         origin_m: (2,) distance of the beams' origins from the axis, and their height.
         T_sensor_lidar: (4, 4), m.
     """
@@ -104,7 +104,7 @@ class OusterMetadata:
     def to_points(self, column: NDArray[np.int64], range_m: Array) -> NDArray[np.float32]:
         """Compute points (C, L, 3), m, of columns (C,) with ranges (C, L), in the sensor's frame.
 
-        Cartesian coordinates of the beams, whose origins turn with the rotor.
+        The beams' origins rotate with the rotor.
         """
         encoder = 2 * np.pi * (1 - column / self.n_columns)[:, None]
         azimuth = encoder - self.azimuth_rad
@@ -127,7 +127,7 @@ def read_metadata(path: Path) -> OusterMetadata:
     """Read the JSON metadata file that Ouster's tools write beside a recording.
 
     Raises:
-        SourceError: it cannot be read, is not one, or its packets' profile is not read.
+        SourceError: the file cannot be read, is not such a file, or its packet profile is not supported.
     """
     with reading(path, hint="Give the JSON file that the sensor or ouster-cli wrote."):
         document = read_json(path)
@@ -151,8 +151,8 @@ def read_metadata(path: Path) -> OusterMetadata:
         else:
             origin_m = 1e-3 * float(document.get("lidar_origin_to_beam_origin_mm", 0.0)), 0.0
     if name not in PROFILES:
-        hint = f"Read are {', '.join(PROFILES)}; convert it to point clouds with Ouster's own tools."
-        raise SourceError(f"{path}: packets of profile {name} are not read", hint)
+        hint = f"Supported are {', '.join(PROFILES)}; convert others to point clouds with Ouster's own tools."
+        raise SourceError(f"{path}: packets of profile {name} are not supported", hint)
     return OusterMetadata(name, n_columns, columns_per_packet, altitude, azimuth, origin_m, T_sensor_lidar)
 
 

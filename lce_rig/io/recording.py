@@ -39,7 +39,7 @@ class SourceOptions:
         camera, channel, lidar: sensors of a folder's images and point clouds; None takes the rig's first
             channel and LiDAR, and the camera from folders' names or the rig's only camera.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
-        is_part: whether other recordings of the same moment hold the sensors missing here.
+        is_part: whether simultaneous recordings hold the sensors missing here.
     """
 
     camera: str | None = None
@@ -83,7 +83,7 @@ class ContinuousRecording(Recording, Protocol):
 def serials_of(recording: Recording) -> dict[str, str]:
     """Return the serial numbers in a recording, by sensor; empty for most recordings.
 
-    A reader that knows them has an attribute `serials`.
+    Readers of formats with serial numbers have an attribute `serials`.
     """
     return dict(getattr(recording, "serials", {}))
 
@@ -154,7 +154,7 @@ def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> t
     """Choose the (camera, channel) of an event file: as requested, else the first with events.
 
     Raises:
-        SourceError: the rig has no camera with a channel of kind events, or not the one asked for.
+        SourceError: the rig has no camera with a channel of kind events, or not the requested one.
     """
     with_events = {name: channel for name in rig.cameras if (channel := event_channel(rig, name))}
     if not with_events:
@@ -177,7 +177,7 @@ def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sampl
     Packets of events count by their first timestamp. Only one sample of each part is held.
 
     Raises:
-        SourceError: a part is torn; after everything that the parts hold, it and the others.
+        SourceError: a part is torn; raised after all samples of all parts.
     """
     torn: list[SourceError] = []
 
@@ -201,7 +201,7 @@ def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sampl
 def follows(stamp_ns: int | None, last_ns: int | None, losses: Losses) -> bool:
     """Check whether a sample comes after its predecessor; count duplicate and late ones, to be skipped.
 
-    A timestamp that is earlier by more than a second is that of a clock that was set: it begins again.
+    A timestamp earlier by more than a second means that the clock was set: the sequence begins again.
     """
     if stamp_ns is None or last_ns is None or stamp_ns > last_ns:
         return True
@@ -290,7 +290,7 @@ def _check_unit(stream: Stream, span_ns: tuple[int, int], other: str, other_ns: 
     """Compare the duration of events with that of their packets' receipt, or of a LiDAR's scans.
 
     Raises:
-        SourceError: they differ by the factor between two units of time.
+        SourceError: the durations differ by the factor between two units of time.
     """
     length_s, other_s = (1e-9 * max(last - first, 1) for first, last in (span_ns, other_ns))
     for unit, (name, remedy) in product(_UNITS, (("small", "Multiply"), ("large", "Divide"))):
@@ -338,7 +338,7 @@ def require_sensors(recording: ContinuousRecording, rig: Rig) -> None:
     """Check that a recording holds a LiDAR and a camera, or two sensors of a rig of one kind.
 
     Raises:
-        SourceError: it does not; the hint names the recording to add.
+        SourceError: a sensor is missing; the hint names the recording to add.
     """
     kinds = {stream.kind for stream in recording.streams}
     holds = ", ".join(f"{stream.kind} of {stream}" for stream in sorted(recording.streams))
@@ -369,7 +369,7 @@ class JoinedRecording:
 
     Attributes:
         path: path of the first recording.
-        notes: those of all, and the skipped sensors.
+        notes: notes of all recordings, and the skipped sensors.
         key: fingerprint of all, in any order.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.
@@ -396,7 +396,7 @@ class JoinedRecording:
         """Yield the samples of all parts, merged by the rig's time.
 
         Raises:
-            SourceError: after everything that can be read, a part is torn.
+            SourceError: a part is torn; raised after everything that can be read.
         """
         try:
             yield from merge_by_time([self._owned(part) for part in self._parts], self._rig)

@@ -82,7 +82,7 @@ class PositionPacket(NamedTuple):
         us: time past the hour on the sensor's counter.
         pps: index into velodyne.PPS_STATES.
         nmea_s: second past the hour in the last sentence received; None without a valid $GPRMC.
-        is_fix: whether that sentence claims to be valid (status A).
+        is_fix: whether that sentence is marked valid (status A).
     """
 
     us: int
@@ -96,8 +96,8 @@ def read_data_packet(
 ) -> DataPacket:
     """Check everything in a payload that its layout determines.
 
-    Ranges and reflectivities can have any value; everything else is bound: flags, azimuths that rise evenly,
-    a time within the hour, known factory bytes.
+    Ranges and reflectivities can have any value; everything else is checked: flags, azimuths that rise
+    evenly, a time within the hour, known factory bytes.
 
     Args:
         payload: payload of the UDP packet.
@@ -105,7 +105,7 @@ def read_data_packet(
         wanted: the model whose packets are read.
 
     Raises:
-        BadPacketError: it is not a data packet of that model.
+        BadPacketError: not a data packet of that model.
     """
     if len(payload) != velodyne.DATA_BYTES:
         raise BadPacketError(f"{len(payload)} bytes")
@@ -147,7 +147,7 @@ def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
     """Decode a position packet, the sensor's report on its clock.
 
     Raises:
-        BadPacketError: it is not a position packet.
+        BadPacketError: not a position packet.
     """
     if len(payload) != velodyne.POSITION_BYTES:
         raise BadPacketError(f"{len(payload)} bytes")
@@ -187,11 +187,11 @@ _N_WINDOWS = 20
 class VelodyneClock:
     """Relates the sensor's counter, its position packets and the host's clock.
 
-    The counter in the packets runs free from power-up, and looks no different then: only pulses and
-    sentences, which the position packets report, tie it to UTC. The hour is never sent.
+    The counter in the packets runs free from power-up, and looks the same without synchronisation: only
+    pulses and sentences, which the position packets report, relate it to UTC. The hour is never sent.
 
     Attributes:
-        position: the position packet that came last; None before the first.
+        position: last position packet; None before the first.
     """
 
     def __init__(self, is_device_wanted: bool = True) -> None:
@@ -209,8 +209,8 @@ class VelodyneClock:
         """Record an arrival.
 
         Args:
-            packet: in its place.
-            elapsed_ns: reading of the counter since any fixed moment.
+            packet: packet in order.
+            elapsed_ns: reading of the counter since any fixed time.
         """
         self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
         if not packet.host_ns:
@@ -254,8 +254,8 @@ class VelodyneClock:
     def _state(self) -> Kind:
         """Find the first reason against using the sensor's time.
 
-        It is trusted if the clock is locked to pulses, the NMEA sentence matches the second of the counter,
-        and the host's clock agrees.
+        The sensor's clock is trusted if it is locked to pulses, the NMEA sentence matches the second of the
+        counter, and the host's clock agrees.
         """
         position, ahead_ns = self.position, self.ahead_ns()
         if not self._is_device_wanted:

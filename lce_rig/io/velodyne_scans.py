@@ -3,7 +3,7 @@
 velodyne-decoder computes the points. Two of its choices matter: it adds the vertical offsets of the lasers
 (up to 11 mm, which ROS 1 drivers omit), and between two azimuths takes the rotor's mean speed over the
 packet, where drivers interpolate block by block (up to 0.025 deg apart). Its StreamDecoder is not used: it
-cuts revolutions at packets, hands on partial ones, and keeps both returns of a firing.
+cuts revolutions at packets, returns partial ones, and keeps both returns of a firing.
 """
 
 import math
@@ -33,7 +33,7 @@ from lce_rig.rig import LidarSettings, Rig
 
 #: Note on recordings, as those of another driver may omit the lasers' vertical offsets.
 OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm), which ROS 1 drivers omit"
-DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
+DUAL_NOTE = "dual returns: the brighter return of each firing is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
 # Number of packets ahead that are accepted without the host's clock; above it, both clocks must agree.
@@ -91,16 +91,16 @@ class Vlp16Stream:
 
     Attributes:
         n_data, n_position: data and position packets that passed the checks.
-        n_scans: revolutions handed on.
+        n_scans: revolutions returned.
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
         product: the model whose packets are decoded.
         other_models: data packets of other models, by name.
         clock: clock of the timestamps.
-        mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
-        rotor_hz: speed of the rotor as it was last; 0 before the first packet.
+        mode: return mode of the last packet, of velodyne.RETURN_MODES; 0 before the first.
+        rotor_hz: last speed of the rotor; 0 before the first packet.
 
     Raises:
-        SourceError: the model's packets are not read, or `driver.controls` cannot be meant.
+        SourceError: the model's packets are not supported, or `driver.controls` is not valid.
     """
 
     def __init__(self, sensor: str, settings: LidarSettings) -> None:
@@ -114,7 +114,7 @@ class Vlp16Stream:
         if product is None:
             read = ", ".join(model.name for model in velodyne.READ)
             raise SourceError(
-                f"lidars.{sensor}.model: packets of {settings.model} are not read", f"Read: {read}."
+                f"lidars.{sensor}.model: packets of {settings.model} are not supported", f"Supported: {read}."
             )
         self.product = product
         self._sensor = sensor
@@ -194,7 +194,7 @@ class Vlp16Stream:
         """Compare the sensor's counter with the host's clock since the previous packet.
 
         Returns:
-            "late" for a packet to skip: it was sent before another that has arrived, or twice;
+            "late" for a packet to skip, which was sent before an arrived one, or twice;
             "after a step" if the sensor's clock (as when it locks to a pulse) or its return mode was set.
         """
         last, self._last = self._last, packet
@@ -304,8 +304,8 @@ class Vlp16Stream:
 def keep_brighter(packets: NDArray[np.void]) -> None:
     """Blank the weaker of two returns in dual-mode packets (P,), or the last of two equal ones.
 
-    At the board's rim, board and wall may both answer one pulse; the sensor reports the brighter answer in
-    its strongest mode.
+    At the board's border, board and wall may both return one pulse; in its strongest mode, the sensor reports
+    the brighter return.
     """
     returns = packets["blocks"]["returns"]
     last, strongest = returns[:, 0::2], returns[:, 1::2]
@@ -331,8 +331,8 @@ class PcapRecording:
         """Find the sensor's packets.
 
         Raises:
-            SourceError: it is not a recording of the network, holds no packets of the profile's model, or
-                those of several sensors of which none has the profile's address.
+            SourceError: the file is not a network recording, or has no packets of the profile's model, or
+                packets of several sensors of which none has the profile's address.
         """
         self.path = path
         self.notes: list[str] = []

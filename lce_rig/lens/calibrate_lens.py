@@ -63,9 +63,9 @@ def estimate_intrinsics(
     """Fit intrinsics and board shape to the corners of all views, each with its own pose and noise level.
 
     Boards are weighted by their own residuals, so that blurred images and noisier channels count less, and
-    views that do not fit the others are refused by name. Errors of corners in one image are correlated: all
-    weights are divided by the ratio of the captures' scatter to that of independent corners, before the
-    prior counts.
+    views that do not fit the others are refused by name. Errors of corners in one image are correlated:
+    before the prior is applied, all weights are divided by the ratio of the captures' scatter to that of
+    independent corners.
 
     Args:
         views: views of at least `MIN_CAPTURES` captures.

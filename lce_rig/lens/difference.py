@@ -1,7 +1,7 @@
 """Pixel difference of two lens models after the rotation of the camera that minimises it.
 
-A shift of the principal point is nearly a small rotation of the camera. Two intrinsics may therefore differ
-in their numbers and still project alike. The relevant figures are the pixel displacement after the best
+A shift of the principal point is nearly a small rotation of the camera. Two sets of intrinsics may therefore
+differ in their values and still project alike. The relevant figures are the pixel displacement after the best
 rotation, and that rotation.
 """
 
@@ -28,7 +28,7 @@ class LensDifference(NamedTuple):
         rms_px: rms distance; infinite if the first model projects none of the pixels.
         sigma_px: root of the mean variance of the displacement.
         turn_rad: (3,) rotation vector from the first camera's rays to the second's.
-        cov_turn: (3, 3) of it, rad^2.
+        cov_turn: (3, 3) covariance of `turn_rad`, rad^2.
     """
 
     rms_px: float
@@ -70,10 +70,10 @@ def compare_lenses(
     The rotation minimises sum |project_2(R ray_1(u)) - u|^2 over the pixels u in the corners' convex hull.
 
     Args:
-        first, second: for images of the same size.
-        corners_px: (n, 2) where boards were seen.
-        cov: (P, P) of the second's parameters.
-        model: model of the second, whose parameters these are.
+        first, second: intrinsics for images of the same size.
+        corners_px: (n, 2) detected board corners.
+        cov: (P, P) covariance of the second's parameters.
+        model: lens model of the second, with these parameters.
 
     References:
         D. Kogan, mrcal: projection difference and implied transformation.
@@ -137,8 +137,8 @@ def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: L
     Args:
         intrinsics: the lens.
         corners_px: (n, 2) where boards were seen; the rotation minimises the deviation there.
-        cov: (P, P) of its parameters.
-        model: whose parameters these are.
+        cov: (P, P) covariance of its parameters.
+        model: lens model with these parameters.
     """
     pixels = _grid(intrinsics).reshape(-1, 2)
     rays = intrinsics.unproject(pixels)

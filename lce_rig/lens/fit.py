@@ -1,7 +1,7 @@
 """Intrinsics from the corners of many boards: least squares over lens, board shape and all poses.
 
-Lens and board are shared by all images, the pose is each one's own: the normal equations have an arrow's
-shape, and eliminating the poses (Schur) leaves one small system however many images there are.
+All images share lens and board, each has its own pose: the normal equations have arrowhead structure, and
+eliminating the poses (Schur) leaves one small system for any number of images.
 
 The board deviates from its nominal shape. A bow of half a millimetre, a twist, a pattern a thousandth too
 long in one direction, corners displaced by a tenth of a millimetre: each moves the focal length or the
@@ -47,8 +47,8 @@ class Setup:
             residuals and derivatives of zero.
         corners_board: (N, 3) nominal, m.
         shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
-        mean: (P + S,) lens and shape a priori.
-        information: (P + S, P + S) of it.
+        mean: (P + S,) prior mean of lens and shape.
+        information: (P + S, P + S) information of the prior.
         model: model of the lens.
         is_lens_free: whether the intrinsics are fitted; else only the board's shape and the poses are.
     """
@@ -68,7 +68,7 @@ class Setup:
         Shapes are `board_shapes`, and x and y of each corner.
 
         Args:
-            corners_px: as measured.
+            corners_px: measured corners.
             board: the board.
             model: model of the lens.
             prior: prior information of lens and board; None without one of the lens.
@@ -111,7 +111,7 @@ class Setup:
     def contradicted(self, lens: Array, cov: Array, chance: float) -> list[tuple[slice, float]]:
         """Compare the boards with the prior of focal lengths, principal point and distortion separately.
 
-        A fitted lens (P,) is the compromise of boards and prior. Its distance d from the prior's has the
+        A fitted lens (P,) is a compromise between boards and prior. Its distance d from the prior's has the
         covariance C_0 - C, with the prior's C_0 and the fitted lens's C: d^T (C_0 - C)^-1 d is chi-squared if
         both are right. In units of C_0, the eigenvalues w of C_0 - C are the boards' shares of the
         information; directions of small shares are left to the prior. The boards' own distance is d / w, of
@@ -120,7 +120,7 @@ class Setup:
         Args:
             lens: the fitted one.
             cov: (P, P) its covariance.
-            chance: probability below which a part contradicts.
+            chance: significance level of a part's contradiction.
 
         Returns:
             The parts of the lens's parameters that contradict, each with the ratio of variances that explains
@@ -185,7 +185,7 @@ class LensState:
 
     Attributes:
         lens: (P,) parameters of the lens model.
-        shape: (S,) of the board.
+        shape: (S,) shape parameters of the board.
         T_cam_board: (K, 4, 4).
     """
 
@@ -249,7 +249,7 @@ def refit_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) ->
 
     Args:
         setup: K boards.
-        state: with the poses to start from.
+        state: lens, board shape, and initial poses.
         tries_mirror: also start from the mirrored tilt, and keep the better result.
     """
     if not tries_mirror:
@@ -296,8 +296,8 @@ def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Arr
 def fit_readout(estimate: IntrinsicsEstimate) -> tuple[Array, Array]:
     """Fit a rolling shutter, rows exposed in turn while the board moved, to each view of an estimate.
 
-    Corners are displaced by the board's motion since the middle row, in proportion to their row. Most of that
-    a pose takes up; the rest shears the board, as no pose does.
+    Corners are displaced by the board's motion since the middle row, in proportion to their row. A pose
+    absorbs most of that; the rest shears the board, which no pose does.
 
     Returns:
         (K, 2) displacement in x and y per row, and (K,) fall of the sum of squared residuals, px^2.

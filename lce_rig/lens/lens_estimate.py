@@ -30,7 +30,7 @@ class BoardView:
     Attributes:
         capture: the image's capture; views of one capture are held out together.
         channel: channel of the camera; each has its own noise level.
-        board: the board's corners, and a pose to start from.
+        board: the board's corners and initial pose.
     """
 
     capture: str
@@ -61,16 +61,16 @@ class IntrinsicsEstimate:
             its height; further bends and displacements, m.
         shape_sigma: (15,) standard deviations of these.
         print_rms_m: remaining displacement of single corners, rms.
-        views: used in the estimate.
+        views: views used in the estimate.
         T_cam_board: (K, 4, 4) of the views.
         residuals_px: (M, 2) of `corners_px`, measured minus predicted.
         held_out_px: (K,) rms distance of each view's corners under intrinsics fitted without its capture;
             NaN without folds.
         surprise: squared distance of the estimate from the profile's intrinsics, in the standard deviations
-            of these: chi-squared with about four degrees of freedom. None if they had no part in it.
+            of these: chi-squared with about four degrees of freedom. None if they were not used.
         is_contradicted: whether the boards contradict the profile's focal lengths, principal point or
             distortion, which are therefore trusted less than the profile states.
-        refused: name of a view -> why the estimate does not use it.
+        refused: reason why the estimate does not use a view, by its name.
     """
 
     model: LensModel

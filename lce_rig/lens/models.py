@@ -24,10 +24,10 @@ class LensModel:
 
     Attributes:
         name: its name on the command line.
-        family: the model of `Intrinsics`.
+        family: corresponding model of `Intrinsics`.
         coefficients: names of the distortion coefficients.
         prior_sigma: standard deviation a priori of each coefficient about zero; inf if there is none. The
-            rational model's upper and lower polynomials can stand in for each other, which this decides.
+            rational model's numerator and denominator are interchangeable; the prior resolves this.
     """
 
     name: str
@@ -117,7 +117,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
 
     Exact where the new model contains the old one; else least squares over a grid of pixels, within the field
     of view where the old model is valid. There the new one must not fold back: a free fit can do so next to
-    the outermost ray, which the model then cannot draw.
+    the outermost ray, which the model then cannot project.
     """
     if intrinsics.model == model.family and len(intrinsics.distortion) <= len(model.coefficients):
         return model.vector(intrinsics)
@@ -129,7 +129,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
         ]
     )
     ridge = np.concatenate([np.zeros(4), np.ones(model.size - 4)])
-    # From opposite sides, half the difference is without decentring, which does not make a lens fold.
+    # Half the difference of opposite sides cancels decentring, which does not make a lens fold.
     angle = np.arccos(rays[:, 2].min())
     rim = [[side * np.sin(a), 0.0, np.cos(a)] for side in (1, -1) for a in (angle + _RIM_RAD, angle)]
     half = np.array([0.5, -0.5, -0.5, 0.5])

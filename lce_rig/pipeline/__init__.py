@@ -5,6 +5,6 @@
     result.write()                               result_files.py: result.json, YAML, URDF, camera_info
     verify(session, result).write()              verification.py: the point clouds projected into the images
 
-Every step takes the output of the one before. Results are frozen dataclasses; only the session and the export
-layer touch files.
+Every step takes the output of the previous one. Results are frozen dataclasses; only the session and the
+export layer touch files.
 """

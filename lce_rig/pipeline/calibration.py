@@ -87,7 +87,7 @@ class _Solved:
         refused: why captures without the board in both sensors are unusable.
         estimate: estimate of the extrinsics.
         validation: validation of the estimate on the camera's own captures and images.
-        lacking: why channels of the camera are not part of it.
+        lacking: reasons why channels of the camera are not included.
         together: the joint estimate that includes it; None if it was estimated separately.
     """
 
@@ -134,10 +134,10 @@ class _Link(NamedTuple):
     """Two cameras that share a LiDAR.
 
     Attributes:
-        members: their indices among those with an estimate.
+        members: indices of the cameras among those with an estimate.
         pair: both compared by the still boards that both saw; None without any.
-        contradictions: between their images and extrinsics.
-        exchanged: whether images came under each other's name.
+        contradictions: contradictions between their images and extrinsics.
+        exchanged: whether the images of the two are exchanged.
     """
 
     members: tuple[int, int]
@@ -166,14 +166,14 @@ def calibrate_session(
     Nothing is written.
 
     Args:
-        session: its folder, or one that is open for reading.
-        detections: of the session; None detects the board first, as `detect_boards` does by default.
+        session: folder of the session, or a session open for reading.
+        detections: detections of the session; None to run `detect_boards` with its defaults.
         options: options of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
-        channels: the cameras' channels to use; None for all that the session holds.
-        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        channels: the cameras' channels to use; None for all in the session.
+        reference: extrinsics to report errors against; neither estimate nor verdict uses them.
         progress: called with (done, total) for each camera and LiDAR in turn.
-        thumbnails: of `detect_boards`, for the report; missing ones are decoded again.
+        thumbnails: images from `detect_boards`, for the report; missing ones are decoded again.
 
     Raises:
         NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
@@ -227,7 +227,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: detections of one session.
-        options, cameras, channels, progress: as in `calibrate_session`.
+        options, cameras, channels, progress: see `calibrate_session`.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.
@@ -321,7 +321,7 @@ def _without_disagreeing(shortages: Sequence[Finding]) -> list[Finding]:
 def _unconnected(rig: Rig, detections: Detections, calibrations: Sequence[Calibration]) -> list[Finding]:
     """List LiDARs without captures, and groups of sensors not connected with the first one's by placements.
 
-    The placement that would connect them is one before the two sensors that share the most captures already.
+    A placement seen by the two sensors that already share the most captures would connect them.
     """
     absent = [LIDAR_ABSENT(name) for name in rig.lidars if name not in detections.lidars]
     held: dict[str, set[str]] = {name: set(found) for name, found in detections.lidars.items()}
@@ -470,7 +470,7 @@ def _open_loops(
 ) -> list[tuple[Loop, Finding]]:
     """List loops of three sensors whose separately estimated poses contradict each other.
 
-    Loops with a pair whose own captures contradict each other are open for that reason, and are left out.
+    Loops with a pair whose own captures contradict each other are skipped: those explain the contradiction.
     """
     poses = {
         (own.camera, own.lidar): (own.estimate.T_cam_lidar, own.validation.cov)

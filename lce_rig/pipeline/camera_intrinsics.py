@@ -64,9 +64,9 @@ class MeasuredIntrinsics:
         estimate: the intrinsics from the boards.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
         certainty: uncertainty of the estimate, per pixel.
-        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
+        judgement: whether the captures determine the intrinsics better than the profile, see `judge_lens`; or
             another lens model that fits them.
-        misfit: how the profile's do not fit; None if they do, or are for another resolution.
+        misfit: misfit of the profile's intrinsics; None if they fit, or are for another resolution.
         weaknesses: directions that the captures do not determine, with advice.
         refused: name of an image -> why the estimate does not use it.
     """
@@ -111,11 +111,11 @@ def measure_intrinsics(
 ) -> MeasuredIntrinsics:
     """Fit a camera's intrinsics to the boards in its images.
 
-    The profile's intrinsics only decide which corners look misplaced. If they turn out to be wrong, corners
-    are detected again with the fitted ones.
+    The profile's intrinsics only serve to find misplaced corners. If they prove wrong, corners are detected
+    again with the fitted ones.
 
     Args:
-        session: open for reading is enough.
+        session: session, open for reading.
         camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
@@ -128,7 +128,7 @@ def measure_intrinsics(
     """
     rig = session.rig
     if model not in (None, *MODELS):
-        raise UsageError(f"there is no lens model {model!r}; there is {', '.join(MODELS)}")
+        raise UsageError(f"unknown lens model {model!r}; choose one of: {', '.join(MODELS)}")
     have = rig.cameras[camera].channels
     unknown = sorted(set(channels) - set(have))
     if unknown:
@@ -247,7 +247,7 @@ def _fit(
     """Fit intrinsics to the boards.
 
     Raises:
-        NotEnoughDataError: too few captures show one; the most frequent causes are named.
+        NotEnoughDataError: too few captures show a board; the most frequent causes are named.
     """
     n_needed = rig.quality.min_captures
     if _n_captures(found) < n_needed:
@@ -275,13 +275,13 @@ def _fit(
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step: one camera_info file per camera.
 
-    Other files there stay, as those of cameras that an earlier run measured.
+    Other files stay, such as those of cameras from an earlier run.
 
     Returns:
         The files of this run.
 
     Raises:
-        SessionError: as `replacing`; earlier files are unchanged.
+        SessionError: see `replacing`; earlier files are unchanged.
     """
     place = session.path / INTRINSICS
     names = {f"camera_info_{one.camera}.yaml": one for one in measured}

@@ -32,8 +32,8 @@ def collect_from(
         recordings: paths of folders, bags and files, or readers with the attributes of `Recording`; several
             simultaneous ones are read as one.
         session: its folder.
-        n_wanted: captures wanted: recordings are read until the session has as many; None for all.
-        sources: how to read the paths, if the profile does not say: all alike, or each by its own.
+        n_wanted: number of captures in the session at which to stop; None to read everything.
+        sources: options for reading the paths: one for all, or one per path.
         progress: called with (done, total) samples.
 
     Returns:
@@ -43,7 +43,7 @@ def collect_from(
         SourceError: a recording cannot be read to its end; captures before it are kept.
         SessionError: the folder is not a session, or cannot be written.
         NotEnoughDataError: no capture could be made; the most frequent causes are named.
-        UsageError: `sources` are not as many as the recordings.
+        UsageError: `sources` and recordings differ in number.
     """
     given: list[Source] = [*recordings] if isinstance(recordings, list | tuple) else [recordings]
     sources = sources or SourceOptions()

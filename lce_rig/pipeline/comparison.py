@@ -105,7 +105,7 @@ def _session_names(paths: Sequence[Path]) -> list[str]:
     """Name sessions by their folder, or by their path if two folders have the same name.
 
     Raises:
-        UsageError: one is given twice.
+        UsageError: a session is given twice.
     """
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):
@@ -119,7 +119,7 @@ def _require_same(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions of different rigs, or with other intrinsics.
 
     Raises:
-        SessionError: with the keys.
+        SessionError: the rigs or some keys differ; the message names them.
     """
     (first_name, first), *others = sessions.items()
     for name, session in others:

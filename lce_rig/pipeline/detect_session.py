@@ -49,8 +49,8 @@ def detect_boards(
 ) -> Detections:
     """Find the board in all samples of a session, or read earlier detections from the cache.
 
-    Where most captures agree on extrinsics, scans of the others are searched again about the place where
-    their image has the board.
+    If most captures agree on extrinsics, scans of the others are searched again around the board's position
+    predicted by their image.
 
     Images are reconstructed from a capture's raw events for the time at which the LiDAR saw the board.
 
@@ -129,7 +129,7 @@ def event_picture(session: Session, capture: Capture, camera: str, channel: str)
 
     Args:
         session: open for reading is enough.
-        capture: holds events of the camera.
+        capture: capture with events of the camera.
         camera, channel: the image's camera and channel.
     """
     finder = _Finder(session)
@@ -326,8 +326,8 @@ def picture_stamp_ns(
 ) -> int | None:
     """Return the time at which a LiDAR saw the board, on the channel's clock; None without timestamps.
 
-    Of several LiDARs, the first in the profile that found the board counts. If none did, or points have no
-    times, the time is the middle of the scan.
+    Of several LiDARs, the first one in the profile that detected the board is used. If none did, or points
+    have no times, the time is the middle of the scan.
     """
     names = [name for name in rig.lidars if name in lidars]
     for name in sorted(names, key=lambda name: not isinstance(lidars[name], list)):
@@ -365,8 +365,8 @@ def match_sensors(
     """Choose the LiDAR's candidates that agree with the images.
 
     Returns:
-        Why captures are unusable, as a sensor found no board or both disagree; and capture -> the candidate
-        that is the board, where three captures agree at least.
+        Reasons why captures are unusable (a sensor found no board, or both disagree); and the matched
+        candidate by capture, if at least three captures agree.
     """
     chosen: dict[str, BoardSurface] = {}
     candidates, refused = detections.candidates(pair, rig.board.to_board())
@@ -398,7 +398,7 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
     """Predict the board's position in scans without it, or with it elsewhere than in the images.
 
     Returns:
-        By LiDAR and capture the poses T_lidar_board (4, 4) that the image leaves open.
+        Possible poses T_lidar_board (4, 4) given the image, by LiDAR and capture.
     """
     expected: dict[str, dict[str, list[Array]]] = {}
     for pair in detections.pairs:

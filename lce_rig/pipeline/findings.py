@@ -78,7 +78,7 @@ def absent_channels(
     """List, by camera, the channels without captures, if another channel has some.
 
     Args:
-        rig: with the channels.
+        rig: the profile.
         detections: detections of the session.
         wanted: names of the channels that are used; None for all.
     """
@@ -133,7 +133,7 @@ SCENE_NO_VIEWS = Kind(
 )
 SCENE_MOVING = Kind(
     "scene_calibration.moving",
-    "{n_views} views of a moving rig are not used: scans or images have no times",
+    "{n_views} views of a moving rig are not used: scans or images have no timestamps",
     "record points with their firing times, or let the rig stand",
     severity="warning",
 )

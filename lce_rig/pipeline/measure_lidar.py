@@ -32,7 +32,7 @@ from lce_rig.session import Session
 # Minimum ratio of a laser's range deviation before and after, for its new value to be written.
 _LEAST_GAIN = 2.0
 _FEWEST_CAPTURES = 8
-_STILL = "Give sessions whose board stood still, on a stand. Leave this one out."
+_STILL = "Give sessions whose board stood still, on a stand. Omit this one."
 
 
 def measure_lidar(
@@ -47,7 +47,7 @@ def measure_lidar(
     Args:
         sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
         lidar: the LiDAR's name in the profiles; None for the only one.
-        found: detections of each session; None detects the board first.
+        found: detections of each session; None to detect the board first.
         progress: called with (done, total) while a session is read.
 
     Raises:
@@ -101,7 +101,7 @@ def measure_lidar(
     n_captures = sum(map(len, used))
     if n_captures < _FEWEST_CAPTURES:
         raise NotEnoughDataError(
-            f"{n_captures} captures of {name} agree with a frame camera ({_FEWEST_CAPTURES} needed)",
+            f"{n_captures} captures of {name} agree with a frame camera (minimum {_FEWEST_CAPTURES})",
             "Collect more captures of a still board, or give more sessions of this LiDAR.",
         )
     errors = estimate_lidar(used, board, starts, options, scale_sigma or None, settings.range_offset_m)
@@ -115,7 +115,7 @@ def measure_lidar(
         raise ResultRefusedError(
             f"{n_captures} captures do not determine the lasers' ranges: standard deviation {after_mm:.1f}, "
             f"without them {before_mm:.1f} mm ({before_mm / _LEAST_GAIN:.1f} mm at most)",
-            "Collect more captures, with the board at several heights, so that each laser meets it in many.",
+            "Collect more captures, with the board at several heights, so that each laser hits it in many.",
         )
     return errors
 
@@ -143,7 +143,7 @@ _SIGMAS = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
 
 
 def lidar_document(errors: LidarErrors) -> dict[str, Any]:
-    """List a LiDAR's errors by profile key; without lasers only their offset."""
+    """Return a LiDAR's errors by profile key; only the range offset if lasers are undetermined."""
     estimate = errors.found
     in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
     figures = np.hstack([estimate.lasers.T * in_degrees, estimate.lasers_sigma.T * in_degrees]).round(7)

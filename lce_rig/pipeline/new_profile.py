@@ -72,7 +72,7 @@ _LENS_FORM = (
 )
 _USUAL_SIZE_PX = (1280, 720)
 _NUMBERS_HINT = (
-    "Leave --from out and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
+    "Omit --from and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
     "--intrinsics radtan,1280x720,1000,1000,640,360,0,0,0,0 --board 8x6,0.07,0.767x0.626"
 )
 
@@ -91,19 +91,19 @@ def new_profile(
 
     Args:
         name: name of the rig.
-        board: as it was measured.
+        board: the measured board.
         recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
             folder with images and point clouds. The beams of an unknown LiDAR are measured in it.
         lidar_model: maker's name of the LiDAR's model; None if unknown.
         cameras: names of the cameras, in the order of a bag's topics.
-        intrinsics: of the cameras, in the same order, or one file for all; empty to read the bag's.
-        source: name of the text in errors.
+        intrinsics: one per camera, in the same order, or one file for all; empty to read the bag's.
+        source: name of the profile in errors.
 
     Returns:
         The text; and a line for each value found or chosen.
 
     Raises:
-        UsageError: a camera without intrinsics, or names or intrinsics of cameras that are not there.
+        UsageError: a camera without intrinsics, or names or intrinsics of missing cameras.
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
@@ -117,7 +117,7 @@ def new_profile(
         for seen, what in ((scans or groups[1:], "point clouds"), (groups, "images or events")):
             if not seen:
                 listed = "; ".join([*map(_line, topics), *skipped])
-                raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", listed)
+                raise SourceError(f"{recording}: no {what}, so it is not a recording of a rig", listed)
         intrinsics = _for_each(intrinsics, len(groups))
         for n, what in ((len(cameras), "names (--camera)"), (len(intrinsics), "--intrinsics")):
             if n not in (0, len(groups)):
@@ -184,7 +184,7 @@ def _survey(recording: Path | None, skipped: list[str]) -> tuple[list[SensorTopi
     """List the topics of a bag, or the images and point clouds of a folder; also the skipped topics.
 
     Raises:
-        SourceError: nothing is there that describes a rig's sensors.
+        SourceError: the path has no description of a rig's sensors.
     """
     if recording is None:
         return [], [], []
@@ -211,9 +211,9 @@ def _lidar(
 
     Args:
         name: name of the LiDAR.
-        model: as it was named.
+        model: name of its model, as given.
         notes: receives differences between the rings of cloud and model.
-        topic: that the cloud is from; None without a bag.
+        topic: topic of the cloud; None without a bag.
         cloud: one scan; None without one.
         where: file or topic, for messages.
     """
@@ -286,7 +286,7 @@ def parse_board(text: str) -> Board:
     """Parse a board, "8x6,0.07,0.767x0.626" or another type in the form of `BOARD_FORM`.
 
     Raises:
-        UsageError: it is not written like this.
+        UsageError: the text has another form.
     """
     compact = text.replace(" ", "")
     try:
@@ -309,7 +309,7 @@ def parse_intrinsics(text: str) -> Intrinsics | CameraFile:
     """Read a camera file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
 
     Raises:
-        UsageError: it is neither.
+        UsageError: the text is neither.
         ProfileError: the file cannot be used.
     """
     model, *values = re.split(r"\s*,\s*|\s+", text.strip())

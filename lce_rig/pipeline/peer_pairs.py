@@ -1,7 +1,7 @@
 """Two sensors of one kind that saw the same boards: their captures, and the verdict on their pose.
 
 In a result T_cam_lidar takes points from the second sensor's frame to the first's. Two cameras are paired
-where one of them has no LiDAR; where both have one, its result relates them.
+if one of them has no LiDAR; if both have one, its result relates them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,9 +39,10 @@ class SolvedPeers:
     Attributes:
         pair: the sensors.
         n_detected: captures with a board in both.
-        refused: why others are unusable.
-        given: the captures that agree.
-        estimate: estimate of the second one's pose, of LiDARs in an optical frame of the first.
+        refused: why each other capture is unusable.
+        given: the boards of the captures that agree.
+        estimate: pose of the second camera in the first one's frame; of the second LiDAR, in an optical frame
+            at the first.
         validation: validation of the estimate.
     """
 
@@ -97,9 +98,9 @@ def solve_peers(
         rig: the profile.
         detections: detections of the session.
         pairs: pairs of two LiDARs or two cameras.
-        options: options of the estimate; the method is always of maximum likelihood.
-        lenses: lenses of cameras that have one already.
-        progress: told what is done.
+        options: options of the estimate; the method is always maximum likelihood.
+        lenses: lenses of cameras that were already fitted.
+        progress: called with each pair.
 
     Returns:
         The results, and for each other pair the cause.

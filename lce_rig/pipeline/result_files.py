@@ -31,8 +31,8 @@ class WrittenResult(NamedTuple):
 
     Attributes:
         files: result.json and the exports.
-        findings: content that exports leave out or change.
-        report: the page; None if it was not asked for.
+        findings: content that exports omit or change.
+        report: the page; None if not requested.
         previous: the folder with the earlier run's files; None if there was none.
     """
 
@@ -54,7 +54,7 @@ class Result:
     Attributes:
         session: the source of the captures.
         pairs: one for each calibrated camera and LiDAR.
-        shortages: for each other camera and LiDAR with captures, why it has no result.
+        shortages: reason why each other camera and LiDAR with captures has no result.
         thumbnails: images that were decoded for the result; the report decodes the others.
     """
 
@@ -67,7 +67,7 @@ class Result:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
 
         Raises:
-            NotEnoughDataError: they have no result.
+            NotEnoughDataError: the sensors have no result.
         """
         for pair in self.pairs:
             if pair.camera == camera and lidar in (None, pair.lidar):
@@ -113,8 +113,8 @@ class Result:
         Args:
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched. The
                 profile of `Session.with_profile` is written there, too.
-            force: export failed results too; each file then says so.
-            report: write report.html, too, as `write_report` does; that of another result does not stay.
+            force: export failed results too; each file is then marked.
+            report: also write report.html, see `write_report`; a report of another result is removed.
 
         Raises:
             UsageError: the name is not valid, or missing where the profile is not the session's own.
@@ -145,7 +145,7 @@ class Result:
         """Draw report.html beside the result.json that `write` has written.
 
         Args:
-            name: as in `write`.
+            name: see `write`.
 
         Raises:
             SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
@@ -180,10 +180,10 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
         is_new: whether it is to be written.
 
     Raises:
-        UsageError: a name that no result, or no new one, can have.
+        UsageError: the name is not valid for a result, or for a new one.
     """
     if is_new and name is not None and (name == CURRENT or name.rpartition("/")[2] == PREVIOUS):
-        raise UsageError(f"no new result can be named {name!r}", "Choose another name.")
+        raise UsageError(f"a new result cannot be named {name!r}", "Choose another name.")
     if name is None or name == CURRENT:
         return session / CALIBRATION
     if name == PREVIOUS:
@@ -254,13 +254,13 @@ def _usable(folder: Path) -> set[str]:
 def _keep_earlier(earlier: Path, draft: Path) -> None:
     """Copy the earlier result, or the one before it, and the user's files into the draft that replaces it.
 
-    The earlier result becomes `previous/` unless only the one before it is usable, or has the only usable
-    result of a camera. If the new result is the same byte for byte, report, overlays and `previous/`
-    stay.
+    The earlier result becomes `previous/`, unless that would lose a usable one: if it failed and its own
+    `previous/` did not, or if only that one has a usable result of some pair, `previous/` stays. If the new
+    result is identical byte for byte, report, overlays and `previous/` stay.
 
     Args:
         earlier: the folder; need not exist.
-        draft: with the new files.
+        draft: folder with the new files.
 
     Raises:
         OSError: a full disk, no permission; or `previous` is a file, or a link.
@@ -302,7 +302,7 @@ class StoredResult(NamedTuple):
 
     Attributes:
         name: "current" and "previous" for those in calibration/, else the name of `calibrate --name`.
-        folder: with its result.json.
+        folder: folder of its result.json.
         file: the file's content; None if it cannot be read.
         problem: why it cannot be read; "" if it can.
         written_s: when it was written, seconds since 1970.

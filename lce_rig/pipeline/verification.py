@@ -73,8 +73,9 @@ class Verification:
         """Project the point clouds into all images of the session, with a page for each pair.
 
         Args:
-            folder: for the images; by default overlays/ beside the session's result.json if the result is its
-                own, else the session's overlays/, replaced in one step. Several pairs get a folder each.
+            folder: folder for the images; by default overlays/ beside the session's result.json if the result
+                is its own, else the session's overlays/, replaced in one step. Several pairs get a folder
+                each.
             progress: called with (done, total) for each pair in turn.
 
         Returns:
@@ -136,10 +137,10 @@ def verify(
     """Compare extrinsics with every capture of a session.
 
     Args:
-        session: may differ from the session that the extrinsics come from.
+        session: session with the captures, not necessarily that of the extrinsics.
         result: result of `calibrate` or `read_result`; None for the session's result.json.
         name: name of the session's result to check; None for the one in calibration/.
-        profile: with which the result was made, as `profile_behind` finds it: its lenses count.
+        profile: profile that the result was made with (`profile_behind`); its intrinsics are used.
         detections: detections of this session; None to detect the board first.
         progress: called with (done, total) while the board is detected.
 

@@ -23,11 +23,11 @@ def hear_scene(
 ) -> SceneOpinion:
     """Compare extrinsics with the edges of the scene in some captures of a session, spread over it.
 
-    Damaged captures are skipped. A camera without frames has no opinion.
+    Damaged captures are skipped. Cameras without frames are not checked.
 
     Args:
         session: any session of the rig.
-        detections: detections of this session: its captures, and where the board is.
+        detections: detections of the board in this session.
         calibration: the extrinsics and their covariance.
         thumbnails: receives the images that were decoded.
     """

@@ -34,20 +34,20 @@ class BoardSettings(Settings):
     """A pattern printed on a rectangular plate, or a plain plate.
 
     Attributes:
-        type: of the pattern: checkerboard, charuco (OpenCV) or aprilgrid (Kalibr); plain for a plate without
-            any, which only LiDARs see.
-        inner_corners: checkerboard: (cols, rows) where four squares meet, one fewer each way than there are
-            squares.
+        type: checkerboard, charuco (OpenCV) or aprilgrid (Kalibr); plain for a plate without a pattern, which
+            only LiDARs detect.
+        inner_corners: checkerboard: (cols, rows) of the points where four squares meet, one fewer than the
+            squares in each direction.
         squares: charuco: (cols, rows) of squares.
         tags: aprilgrid: (cols, rows) of tags, Kalibr's tagCols and tagRows.
-        square_m: side of one square, or of one tag (tagSize), measured over many on the pattern itself.
+        square_m: side of one square, or of one tag (tagSize), measured over many of them on the print.
         marker_m: charuco: side of a marker, its black border included.
         tag_spacing: aprilgrid: gap between tags over their side, Kalibr's tagSpacing.
-        dictionary: charuco: of the markers, OpenCV's name without DICT_. Tags are of the family 36h11.
-        first_id: charuco, aprilgrid: of the first marker; 0 by default.
+        dictionary: charuco: OpenCV's name of the marker dictionary, without DICT_. AprilGrids use tag36h11.
+        first_id: charuco, aprilgrid: id of the first marker; 0 by default.
         width_m: outer width of the plate, along the columns.
         height_m: outer height of the plate, along the rows.
-        pattern_offset_m: (x right, y up) of the pattern's centre from the plate's centre.
+        pattern_offset_m: (right, up) from the plate's centre to the pattern's.
         square_sigma_m: standard deviation of `square_m`; by default 0.2 % of it.
         pattern_offset_sigma_m: standard deviation of each coordinate of `pattern_offset_m`.
         plate_sigma_m: standard deviation of `width_m` and of `height_m`.
@@ -75,7 +75,7 @@ class BoardSettings(Settings):
     @classmethod
     def _dictionary_exists(cls, value: str | None) -> str | None:
         if value is not None and value.removeprefix("DICT_") not in DICTIONARIES:
-            raise problem(f"{value} is no dictionary; choose one of {', '.join(DICTIONARIES)}")
+            raise problem(f"{value} is not a dictionary; choose one of {', '.join(DICTIONARIES)}")
         return None if value is None else value.removeprefix("DICT_")
 
     @model_validator(mode="after")

@@ -60,7 +60,7 @@ def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[
 
     Args:
         camera: the camera's name.
-        lens: with the images' size.
+        lens: intrinsics, with the image size.
         others: further keys of the block `intrinsics`.
     """
     block = {f"cameras.{camera}.intrinsics.{key}": v for key, v in (lens_block(lens) | others).items()}

@@ -90,14 +90,14 @@ def read_profile(path: Path) -> str:
     """Read the text of a profile's file.
 
     Raises:
-        ProfileError: it cannot be read, or is not text.
+        ProfileError: the file cannot be read, or is not text.
     """
     with reading(path, ProfileError, most_bytes=MAX_TEXT_BYTES):
         try:
             return path.read_text(encoding="utf-8")
         except UnicodeDecodeError:
             hint = "Give the YAML file of a rig; recordings are given with --from."
-            raise ProfileError(f"{path}: it is no profile, as it is not text", hint) from None
+            raise ProfileError(f"{path}: not a profile: it is not text", hint) from None
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:
@@ -182,7 +182,7 @@ class Document:
     Attributes:
         source: file the text came from.
         data: the plain data.
-        root: the nodes, which know their lines; None if errors are to name keys only.
+        root: the nodes, with their lines; None if errors are to name keys only.
     """
 
     source: str

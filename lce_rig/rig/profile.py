@@ -87,7 +87,7 @@ class TriggerSettings(Settings):
     Attributes:
         channel: number of the board's line.
         rate_hz: pulses per second.
-        phase_us: first pulse of a second after that second's beginning.
+        phase_us: delay of the first pulse of a second after its beginning.
         pulse_us: length of a pulse.
         max_delay_s: maximum delay of an image's timestamp after its pulse; as short as the camera allows.
     """
@@ -111,9 +111,9 @@ class SyncSettings(Settings):
     """A board that generates the pulse per second and triggers cameras.
 
     Attributes:
-        type: its protocol: lce-rig's own (docs/sync-protocol.md).
+        type: serial protocol: lce-rig's own (docs/sync-protocol.md).
         device: serial port of the board.
-        baud: speed of the port; None for 115200, any over USB.
+        baud: speed of the port; None for 115200; ignored over USB.
         triggers: the trigger lines, by the camera's name.
     """
 
@@ -143,7 +143,7 @@ class Mount(Settings):
     Attributes:
         parent: a frame of the robot, such as base_link.
         of: the frame of the LiDAR, or of a camera's body, whose pose is given.
-        xyz_m: its origin in the parent's frame.
+        xyz_m: origin of that frame in the parent's.
         rpy_deg: (roll, pitch, yaw) about the parent's fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
     """
 
@@ -173,8 +173,7 @@ class NominalExtrinsic(Settings):
         translation_m: t, the LiDAR's origin in the optical frame.
         source: "cad" for this rig's CAD model, with which the result must agree; "typical" for a common
             mounting of such rigs, used for guidance and simulation but not to judge results.
-        tolerance_deg: larger differences from the result are reported.
-        tolerance_m: larger differences from the result are reported.
+        tolerance_deg, tolerance_m: larger differences from the result are reported.
     """
 
     camera: Name
@@ -247,7 +246,7 @@ class Rig(Settings):
         format_version: version of this schema.
         name: name of the rig; a session belongs to one rig by name.
         description: one line for `lce-rig rigs`.
-        robot: name of the robot that carries this very rig; results name it.
+        robot: name of the robot that carries this rig; stored in results.
         base_frame: a LiDAR's or camera's frame, root of the URDF; by default that of `mount`, or the first
             LiDAR's.
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
@@ -255,7 +254,7 @@ class Rig(Settings):
         lidars: settings by the LiDAR's name; none where cameras are calibrated with each other alone.
         cameras: settings by the camera's name; none where LiDARs are calibrated with each other alone.
         nominal_extrinsics: the CAD model's values, a sanity check only.
-        sync: the board that makes the pulse per second and triggers cameras; None without one.
+        sync: the board that generates the pulse per second and triggers cameras; None without one.
     """
 
     format_version: Literal[1]
@@ -313,7 +312,8 @@ class Rig(Settings):
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
         mount = self.mount
         for key, root in (("base_frame", self.base_frame), ("mount.of", mount.of if mount else None)):
-            require(root in (None, *roots), f"no sensor has frame {root}; there is {', '.join(roots)}", key)
+            what = f"no sensor has frame {root}; choose one of: {', '.join(roots)}"
+            require(root in (None, *roots), what, key)
         if mount is not None:
             what = f"{mount.parent} is the frame of {used.get(mount.parent)}, not of the robot"
             require(mount.parent not in used, what, "mount.parent")
@@ -356,7 +356,7 @@ class Rig(Settings):
         require(is_whole, "a rig has a camera and a LiDAR, two LiDARs or two cameras", "cameras")
         if self.cameras and self.board.type == "plain":
             what = f"a plain plate has no pattern for {next(iter(self.cameras))}"
-            raise problem(f"{what}; name the print of your board, or remove the cameras", "board.type")
+            raise problem(f"{what}; describe the pattern of your board, or remove the cameras", "board.type")
         used: set[tuple[str, str]] = set()
         for index, entry in enumerate(self.nominal_extrinsics):
             of_lidars = [name for name in self.lidars if name != entry.lidar]
@@ -373,7 +373,7 @@ class Rig(Settings):
             require(pair not in used, what, f"nominal_extrinsics.{index}")
             used.add(pair)
         for name in self.sync.triggers if self.sync else ():
-            what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
+            what = f"no camera is called {name}; choose one of: {', '.join(self.cameras)}"
             require(name in self.cameras, what, f"sync.triggers.{name}")
         return self
 

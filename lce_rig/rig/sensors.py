@@ -36,7 +36,7 @@ class TimestampSettings(Settings):
     """The meaning of a sensor's timestamps.
 
     Attributes:
-        clock: the clock that is read: the sensor's own, the computer's, or UTC by GPS or PTP.
+        clock: clock of the timestamps: the sensor's own, the computer's, or UTC by GPS or PTP.
         reference: the moment a timestamp marks: start or middle of the exposure, first or last firing.
         sync: how clocks are synchronised: by a shared pulse, by PTP, or not at all.
         expected_offset_s: offset to add to these timestamps to get the rig's time.
@@ -56,9 +56,9 @@ class FrameTimingSettings(Settings):
     Attributes:
         clock: the clock that timestamps images; "auto" finds the one that fits.
         mark: the moment that is timestamped; "auto" uses the driver's flags.
-        exposure_us: exposure time of a row; None reads it from the camera.
+        exposure_us: exposure time of a row; None to read it from the camera.
         line_time_us: time between rows of a rolling shutter; 0 for a global one.
-        trigger_delay_us: from the trigger's edge to the start of the first row's exposure.
+        trigger_delay_us: time from the trigger's edge to the start of the first row's exposure.
     """
 
     clock: Literal["auto", "monotonic", "monotonic_raw", "tsc", "boottime", "realtime"] = "auto"
@@ -99,8 +99,8 @@ class LaserSettings(Settings):
 
     Attributes:
         ring: the ring's number.
-        range_m: positive for ranges too long.
-        azimuth_deg, elevation_deg: by which its true beam deviates from the reported one.
+        range_m: range error, positive for too long.
+        azimuth_deg, elevation_deg: deviation of the true beam from the reported one.
     """
 
     ring: Annotated[int, Field(ge=0, le=1000)]
@@ -117,8 +117,8 @@ class LidarIntrinsicsSettings(Settings):
 
     Attributes:
         lens_lateral_m: displacement of the beams' origin from the axis, towards growing azimuth.
-        lens_vertical_m_per_rad: its height, per rad of elevation.
-        lasers: errors of each.
+        lens_vertical_m_per_rad: height of that origin, per rad of elevation.
+        lasers: errors of each laser.
     """
 
     lens_lateral_m: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
@@ -133,16 +133,16 @@ class LidarSettings(Settings):
 
     Attributes:
         model: maker's name of the model, or "other".
-        serial: serial number of this very unit, for devices that do not report it.
+        serial: serial number of the unit, for devices that do not report it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
-        rate_hz: rate of its scans. Without rings, scans that come faster are accumulated to this rate.
+        rate_hz: rate of its scans. Without rings, faster scans are accumulated to this rate.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
         elevations_deg: elevations of the rings, lowest first; None for the model's.
         columns: firings of each ring per revolution; None for the model's.
         beam_aperture_m: width of the light beam at the sensor's exit; 0 for an ideal one.
-        beam_divergence_rad: full angle by which the beam widens.
+        beam_divergence_rad: full divergence angle of the beam.
         range_offset_m: constant excess of the driver's ranges, the same for all; subtracted first.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
         range_offset_sigma_m: standard deviation of that mean, the error common to all ranges left after
@@ -270,7 +270,7 @@ class CameraSettings(Settings):
 
     Attributes:
         model: maker's name of the model.
-        serial: serial number of this very unit, for devices that do not report it.
+        serial: serial number of the unit, for devices that do not report it.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
         resolution_px: (width, height) of the images.

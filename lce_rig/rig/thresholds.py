@@ -14,7 +14,7 @@ class QualitySettings(Settings):
     """Limits for using a capture and for passing a result.
 
     Attributes:
-        min_square_px: least side of a square in the image; below it corners are blurred together.
+        min_square_px: least side of a square in the image; below it, corners blur into each other.
         min_border_px: least distance of a corner from the image's border.
         max_tilt_deg: largest angle between the board's normal and the line of sight.
         max_reprojection_px: largest rms corner residual.
@@ -27,10 +27,11 @@ class QualitySettings(Settings):
         max_distance_m: farthest board.
         max_motion_m: largest motion of a board that counts as still.
         min_events_px: fewest events on the board in 1 s, per pixel.
-        min_event_contrast: least difference of black and white in an image made from events, grey values.
+        min_event_contrast: least difference of black and white in an image reconstructed from events, grey
+            values.
         min_event_sharpness: fewest edge widths per square of such an image.
         max_board_speed_mps: fastest board that events may show.
-        max_turn_deg_s: fastest turn of such a board.
+        max_turn_deg_s: fastest rotation of such a board.
         max_smear_m: largest motion of such a board during its scan.
         min_captures: minimum number of captures for a calibration.
         min_detected_fraction: a smaller fraction of captures with the board found is marginal.

@@ -174,7 +174,7 @@ class Capture:
         """Read an image exactly as it was captured.
 
         Raises:
-            SessionError: there is none, or it is damaged.
+            SessionError: the image is missing or damaged.
         """
         import cv2
 
@@ -187,7 +187,7 @@ class Capture:
         """Read a scan exactly as it was captured.
 
         Raises:
-            SessionError: there is none, or it is damaged.
+            SessionError: the scan is missing or damaged.
         """
         entry, data = self._load(f"scan of {lidar}")
         with self._reading(entry.file):
@@ -206,7 +206,7 @@ class Capture:
         """Read the events around this capture exactly as recorded, timestamps to the microsecond.
 
         Raises:
-            SessionError: there are none, or they are damaged.
+            SessionError: the events are missing or damaged.
         """
         entry, data = self._load(f"events of {camera}")
         with self._reading(entry.file):
@@ -216,7 +216,7 @@ class Capture:
         """Read every file once.
 
         Raises:
-            SessionError: the first thing found wrong.
+            SessionError: the first fault found.
         """
         for entry in self._manifest.files:
             self._read(entry)
@@ -260,18 +260,18 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
     """Check that samples can be one capture of a rig.
 
     Raises:
-        SessionError: there are none, two of one sensor, one of a sensor that the rig lacks, or events of
+        SessionError: there are no samples, two of one sensor, one of a sensor not in the rig, or events of
             another resolution than the camera's.
     """
     sources = [f"image of {i.sensor}.{i.channel}" for i in images]
     sources += [f"scan of {s.sensor}" for s in scans] + [f"events of {e.sensor}" for e in events]
     if len(set(sources)) < len(sources) or not sources:
         raise SessionError(
-            "a capture holds at most one image per camera channel, one scan per lidar and one stretch of "
-            "events a camera at most, and not nothing"
+            "a capture holds at least one sample, and at most one image per camera channel, one scan per "
+            "LiDAR and one stretch of events per camera"
         )
     if foreign := _foreign(sources, rig):
-        raise SessionError(f"rig {rig.name!r} has no {foreign}", "Add it to the profile, or leave it out.")
+        raise SessionError(f"rig {rig.name!r} has no {foreign}", "Add it to the profile, or omit it.")
     for stretch in events:
         size, wanted = (stretch.width_px, stretch.height_px), rig.cameras[stretch.sensor].resolution_px
         if size != wanted:
@@ -286,7 +286,7 @@ def check_capture(rig: Rig, capture: Capture) -> None:
     """Check that all sensors in a capture belong to its rig.
 
     Raises:
-        SessionError: it names another sensor, or its manifest is damaged.
+        SessionError: the capture names another sensor, or its manifest is damaged.
     """
     if foreign := _foreign(capture.sources, rig):
         raise SessionError(
@@ -307,7 +307,7 @@ def _foreign(sources: Sequence[str], rig: Rig) -> str | None:
 def content_hash(images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()) -> str:
     """Fingerprint samples without their timestamps, independently of the files they came from.
 
-    Of events, the time differences count.
+    Events count with their time differences.
 
     Returns:
         SHA-256 as hex digits.
@@ -338,7 +338,7 @@ def write_capture(
     """Fill an empty folder with one capture, every file flushed to the disk.
 
     Args:
-        events: with the channel that they come from.
+        events: events with their channel.
 
     Raises:
         OSError: a full disk, no permission.

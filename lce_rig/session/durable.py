@@ -54,7 +54,7 @@ def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
 
     Args:
         path: path of the file or folder.
-        n_safe: captures before it, which are safe.
+        n_safe: number of captures already saved.
 
     Raises:
         SessionError: a full disk, no permission, or something in the file's place.
@@ -65,7 +65,7 @@ def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
         if isinstance(error, FileExistsError | NotADirectoryError):
             hint = "Move away what is in its place, or choose another folder."
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            hint = "Choose a folder that you may write to, or see to its permissions."
+            hint = "Choose a folder that you may write to, or change its permissions."
         else:
             hint = "Make room or choose another disk. The same command then goes on where it stopped."
         safe = f" The {n_safe} captures before it are safe." if n_safe else ""
@@ -83,7 +83,7 @@ def store_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> bool:
     """Write an entry of a cache: arrays by name, without pickle; the same arrays give the same bytes.
 
     Returns:
-        Whether it could be written: a full or read-only disk only costs the time saved.
+        Whether it could be written. A full or read-only disk is no error: the cache only saves time.
     """
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **dict(sorted(arrays.items())))
@@ -115,7 +115,7 @@ def flush_folder(path: Path) -> None:
 def append_line(path: Path, line: str) -> None:
     """Append one line and flush it.
 
-    A torn last line of an earlier run, which was killed or found the disk full, is closed first.
+    A torn last line of an earlier run (killed, or full disk) is terminated first.
 
     Raises:
         OSError: a full disk, no permission.
@@ -131,8 +131,8 @@ def append_line(path: Path, line: str) -> None:
 class WriterLock:
     """One writer per session.
 
-    The kernel holds the lock (flock) and drops it when its holder dies, however that happens: a lock is never
-    stale. The file names the holder, for the message only.
+    The kernel holds the lock (flock) and releases it when its holder dies, so locks are never stale. The file
+    names the holder, for the message only.
 
     Raises:
         SessionError: another process writes.
@@ -168,8 +168,8 @@ def replacing(
 ) -> Iterator[Path]:
     """Yield an empty draft that replaces a folder when the block ends, by two renames.
 
-    If the block raises, or anything fails before them, the folder stays unchanged. Where a process is killed
-    between the two, `recover` puts the earlier folder back.
+    If the block raises, or anything fails before the renames, the folder stays unchanged. If a process is
+    killed between the two, `recover` restores the earlier folder.
 
     Args:
         root: the session's folder, in which drafts are made.

@@ -58,7 +58,7 @@ class DifferingKey(NamedTuple):
 
     Attributes:
         path: path of the key, such as ("cameras", "davis", "frame").
-        theirs, ours: values of the key, "absent" if a profile lacks it.
+        theirs, ours: values of the key; "absent" if missing in a profile.
     """
 
     path: tuple[str, ...]

@@ -1,9 +1,9 @@
 """A session folder: the copied rig profile, captures, a journal and a cache of detections.
 
-Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
-captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to
-captures/.new-000012/, its files are flushed, the folder is renamed and its parent flushed: it exists whole or
-not at all, whenever the power goes. A rejected capture is its folder moved to rejected/.
+Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and captures/000012/{meta.json,
+cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to captures/.new-000012/, its files are
+flushed, the folder is renamed and its parent flushed: it exists completely or not at all, even after a power
+failure. The folder of a rejected capture is moved to rejected/.
 """
 
 import json
@@ -54,8 +54,8 @@ CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics"
 class Session:
     """A session, open for reading, or for writing by one process at a time.
 
-    `create`, `open` and `resume` make one. Use it in a `with` statement, or `close` it, so that the next
-    writer can come in.
+    Made by `create`, `open` and `resume`. Use it in a `with` statement, or `close` it, to release the
+    writer's lock.
 
     Attributes:
         path: the session's folder.
@@ -104,12 +104,12 @@ class Session:
         """Open an existing session; opening for writing also clears the remains of a killed writer.
 
         Raises:
-            SessionError: it is not a session, damaged, made by a newer version, or another process writes to
-                it.
+            SessionError: the folder is not a session, damaged, made by a newer version, or another process
+                writes to it.
         """
         path = Path(path)
         named = read_marker(path)
-        with suppress(OSError):  # without permission to write, nothing was put aside
+        with suppress(OSError):  # without write permission there is nothing to recover
             recover(path)
         try:
             rig = load_rig(path / PROFILE)
@@ -135,10 +135,10 @@ class Session:
     def resume(cls, path: Path | str, rig: Rig) -> "Session":
         """Continue the session of this rig in a folder, or start one there.
 
-        A session without captures takes the profile, even with differences.
+        A session without captures adopts the profile, even with differences.
 
         Raises:
-            SessionError: as `create` and `open`, or the session belongs to another rig.
+            SessionError: see `create` and `open`; or the session belongs to another rig.
         """
         path = Path(path)
         if not (path / MARKER).exists():
@@ -168,7 +168,7 @@ class Session:
         Detections whose keys in the cache depend on the changes are computed again.
 
         Args:
-            rig: with the session's name and sensors; board, intrinsics, limits and the like may differ.
+            rig: profile of the same name and sensors; board, intrinsics, limits and the like may differ.
 
         Returns:
             The file of the earlier profile, such as "rig-1.yaml"; "" if both are the same.
@@ -195,7 +195,7 @@ class Session:
         """Return the session, open for reading, with another profile of the same rig; files do not change.
 
         Args:
-            rig: as in `adopt`.
+            rig: see `adopt`.
 
         Raises:
             SessionError: the profile is of another rig.
@@ -219,7 +219,7 @@ class Session:
         """Fill in another profile's robot and serial numbers from this session.
 
         Raises:
-            SessionError: it is of another rig.
+            SessionError: the profile is of another rig.
         """
         foreign = foreign_keys(self.rig, rig)
         if foreign:
@@ -285,7 +285,7 @@ class Session:
         """Find one capture.
 
         Raises:
-            SessionError: there is none of that name.
+            SessionError: there is no capture of that name.
         """
         for capture in self.captures:
             if capture.name == name:
@@ -306,11 +306,11 @@ class Session:
         return self.rig.corrected(capture.scan(lidar))
 
     def reject(self, name: str, reason: str = "") -> None:
-        """Reject a capture: it is no longer used, and not collected again.
+        """Reject a capture, so that it is neither used nor collected again.
 
         Args:
             name: name of the capture.
-            reason: kept in the journal.
+            reason: reason for the journal.
 
         Raises:
             SessionError: the capture does not exist, or the session or its disk is read-only.

@@ -32,7 +32,7 @@ def render(template: str, **values: object) -> str:
 
     Args:
         template: file of `templates/`; it extends frame.html.
-        values: by the template's names. Text is escaped; `svg.Axes` returns markup, which is not;
+        values: values by name. Text is escaped; `svg.Axes` returns markup, which is not;
             the filter `words` sets the texts of findings.
     """
     return environment().get_template(template).render(**values) + "\n"

@@ -1,6 +1,6 @@
 """Drawings of a page as inline SVG: axes with round ticks, and marks in data coordinates.
 
-Matplotlib took a third of the time of `calibrate`, most of it for its import.
+Own drawing code: Matplotlib took a third of the time of `calibrate`, mostly for its import.
 """
 
 from collections.abc import Sequence
@@ -163,7 +163,7 @@ class Axes:
         """Draw dots of a diameter at points (N, 2), as one element.
 
         Args:
-            points: their middles.
+            points: centres of the dots.
             colour: a colour name of this module.
             size: the diameter, or the side of a square.
             shape: "round" or "square".
@@ -181,11 +181,11 @@ class Axes:
         """Draw arrows from points (N, 2) with a key at the upper right.
 
         Args:
-            starts: their tails.
+            starts: tails of the arrows.
             vectors: (N, 2) in data units.
             colour: a colour name of this module.
             unit: length in data units of the key's arrow.
-            key: its label.
+            key: label of the key.
         """
         # Vectors turn with the axes.
         self._group([f'<path d="{_arrows(self.at(starts), vectors * self._scale)}"/>'], f"fill: {colour}")
@@ -201,7 +201,7 @@ class Axes:
         """Return the drawing; the same marks give the same bytes.
 
         Args:
-            label: its content, for screen readers.
+            label: description of the drawing, for screen readers.
             name: name of its clipping path, unique in the page.
         """
         left, top, right, bottom = self._box

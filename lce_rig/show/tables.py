@@ -22,10 +22,10 @@ class Table(NamedTuple):
     """A table; one without rows is not shown.
 
     Attributes:
-        title: above it.
+        title: title above the table.
         headings: headings of the columns.
         rows: rows of cells.
-        n_texts: the first columns hold text, the others figures.
+        n_texts: number of leading columns with text; the others hold figures.
     """
 
     title: str

@@ -91,7 +91,7 @@ def build_backdrop(
     """Render the static room from a camera at T_world_cam (4, 4); a draft at half the resolution."""
     origin = T_world_cam[:3, 3]
     corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
-    # The corner in the middle of each 2 x 2 pixels stands for them.
+    # One ray for each 2 x 2 pixels, through the corner in their middle.
     rays = corners[1::2, 1::2] if is_draft else pixel_rays(corners)
     flat, range_m = _render(room, origin, rays.reshape(-1, 3))
     radiance, range_m = flat.reshape(rays.shape), range_m.reshape(rays.shape[:2])
@@ -155,7 +155,7 @@ def _rays_beyond_the_lens(intrinsics: Intrinsics, pixels: Array) -> Array:
 def lens_reach(intrinsics: Intrinsics) -> float:
     """Find the |(pixel - c) / f| up to which images follow the lens model.
 
-    Just before it folds, the polynomial's slope falls to zero: images leave it a little earlier.
+    The polynomial's slope falls to zero just before it folds: images end a little earlier.
     """
     widest = 0.999 * intrinsics.max_radius
     if intrinsics.model == "equidistant":

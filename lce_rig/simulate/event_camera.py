@@ -71,10 +71,10 @@ class EventCamera:
         pixels: the sensor.
         noise: the sensor's errors.
         radiance: (H, W) linear intensity at the start, to which the pixels have settled.
-        start_ns: when that is, on the rig's clock.
+        start_ns: time of the start, on the rig's clock.
         rng: source of noise.
         sensor: name in the rig profile.
-        offset_ns: how much more its timestamps read than the rig's clock.
+        offset_ns: excess of its timestamps over the rig's clock.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class EventCamera:
             return
         threshold = np.where(is_on, self._on[pixel], self._off[pixel])
         sign = np.where(is_on, 1.0, -1.0)
-        # Rounding can leave a pixel at its threshold with no slope, or one away from it.
+        # By rounding, a pixel at its threshold may have no slope, or the wrong sign.
         rate = np.maximum(sign * slope, 1e-9)
         first_s = start_s + np.clip((threshold - sign * excess) / rate, 0.0, now_s - start_s)
         # After its first event a pixel starts from zero: the others follow at a constant distance.

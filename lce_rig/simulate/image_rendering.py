@@ -18,7 +18,7 @@ from lce_rig.simulate.backdrop import (
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.scene import Raycaster, Scene
 
-#: Samples a pixel along each axis wherever an edge runs through it.
+#: Samples per pixel along each axis, at edges.
 SUBPIXELS = 5
 _GAMMA = 1 / 2.2
 
@@ -29,7 +29,7 @@ def render_radiance(scene: Scene, backdrop: Backdrop, *, is_draft: bool = False)
     Args:
         scene: the room of the backdrop, with the board and its carrier.
         backdrop: the camera and its image of the static room.
-        is_draft: one ray a pixel and no shadows of board and carrier, at a tenth of the time.
+        is_draft: one ray per pixel and no shadows of board and carrier, in a tenth of the time.
     """
     radiance: Array = backdrop.radiance.copy()
     rows, cols = _region(scene, backdrop)

@@ -56,7 +56,7 @@ def _echoes(scene: Scene, hits: Hits, origins: Array, directions: Array) -> Retu
     return Returns(hits.range_m, reflectivity * cosine, reflectivity, hits.surface)
 
 
-#: Where a beam is probed for a second surface, in half-widths.
+#: Points of a beam probed for a second surface, in half-widths.
 _PROBES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 # Cells of equal energy over a beam: positions (K, 2) in half-widths, within an ellipse of radius 1.
 _GRID = np.stack(np.meshgrid((np.arange(16) - 7.5) / 8, (np.arange(8) - 3.5) / 4, indexing="ij"), axis=-1)
@@ -68,7 +68,7 @@ _PULSE_M = 0.5
 def _sub_rays(origins: Array, directions: Array, cells: Array, noise: LidarNoise) -> tuple[Array, Array]:
     """Spread beams (N, 3) into origins and unit directions (N, K, 3) through the footprint's cells."""
     # A tilted LiDAR still turns about its own axis; world z serves as that axis to first order only,
-    # which is exact for an upright LiDAR and turns the footprint's ellipse a little for a tilted one.
+    # which is exact for an upright LiDAR and rotates the footprint's ellipse a little for a tilted one.
     across = np.cross([0.0, 0.0, 1.0], directions)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
     up = np.cross(directions, across)
@@ -153,8 +153,8 @@ _LINE_RAD = np.radians(0.7)
 def _pattern(sheet: DataSheet, starts_ns: NDArray[np.int64]) -> tuple[Array, Array]:
     """Aim the firings (N,) of a LiDAR without rings: azimuth and elevation, rad.
 
-    Two prisms turn the beam by half of the field's radius each: a rosette, densest in its middle. A Mid-360's
-    lines sweep elevation while its rotor turns. Neither repeats within minutes.
+    Two prisms deflect the beam by half of the field's radius each: a rosette, densest in its middle. A
+    Mid-360's lines sweep elevation while its rotor turns. Neither repeats within minutes.
     """
     t_s = 1e-9 * starts_ns
     width, low, high = np.radians(sheet.fov_deg)
@@ -180,10 +180,10 @@ class LidarModel:
         azimuths_rad: (L,) of each laser from the rotor's.
         vertical_offsets_m: (L,) height of each laser's optical centre.
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
-        starts_ns: (L,) when each laser fires after the first of its sequence.
+        starts_ns: (L,) firing time of each laser after the first of its sequence.
         sequence_ns: time between two sequences.
         period_ns: duration of one revolution, or of the scans that are accumulated.
-        pattern: as in the data sheet.
+        pattern: scan pattern, see `DataSheet`.
     """
 
     name: str
@@ -239,7 +239,7 @@ class Sweep(NamedTuple):
         offset_ns: (N,) after the first firing.
         azimuth_rad: (N,).
         returns: returns of each firing.
-        is_rim: (N,) whether the beam met the board's border.
+        is_rim: (N,) whether the beam hit the board's border.
     """
 
     laser: NDArray[np.intp]
@@ -262,14 +262,14 @@ def sweep_scene(
     """Trace the beams of one revolution.
 
     Args:
-        scene: the surfaces that the beams meet.
+        scene: surfaces that the beams hit.
         T_world_lidar: (4, 4).
         model: the LiDAR's geometry and timing.
         noise: the sensor's errors.
         rng: source of the azimuth phase.
         stamp_ns: device time of the first firing.
         board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.
-        lidar_at: T_world_lidar (N, 4, 4) at such times, of a moving rig; None for `T_world_lidar`.
+        lidar_at: T_world_lidar (N, 4, 4) of a moving rig at such times; None for `T_world_lidar`.
     """
     laser, offset_ns, azimuth_rad = _firings(model, rng)
     if lidar_at is not None:
@@ -309,7 +309,7 @@ def measure_sweep(
 
     Args:
         sweep: the surfaces.
-        model, noise: as for the sweep.
+        model, noise: those that the sweep was computed with.
         rng: source of all noise.
         laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
         sensor: name in the rig profile.

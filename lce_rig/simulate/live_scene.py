@@ -23,7 +23,7 @@ class LiveScene:
     """Renders images and scans of a moving board.
 
     For a held board, images are rendered and beams are traced once; each image and scan has its own
-    noise. On its way, when nothing is captured, both are drafts: images without shadows and anti-aliasing,
+    noise. While it moves and is not captured, both are drafts: images without shadows and anti-aliasing,
     infinitely thin beams. The room is always a draft, so that a collection starts sooner.
 
     Attributes:

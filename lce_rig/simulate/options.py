@@ -30,7 +30,7 @@ class LidarNoise:
         dark_bias_m: excess range of a return of reflectivity 0 over one of reflectivity 1.
         weak_bias_m: excess range of the weakest returns (intensity 0; none from intensity 30 on).
         rim_spread_rad: half-width of the azimuth error of points within a footprint of the board's border.
-        edge_growth_m: how much wider the beam's rim is than divergence and exit explain; with it the returns
+        edge_growth_m: width of the beam's rim beyond divergence and exit; with it the returns
             reach 9-10 mm beyond a board's border, as they do on real recordings.
         divergence_rad: full opening of the beam, horizontal and vertical.
         exit_size_m: size of the beam at the sensor's exit, horizontal and vertical.
@@ -106,8 +106,8 @@ class EventNoise:
         threshold_sigma: spread of the pixels' own thresholds, fixed for a session.
         event_sigma: spread of one pixel's threshold from event to event.
         cutoff_hz: bandwidth of a pixel that sees full white; darker ones are slower. inf for no limit.
-        refractory_s: how long a pixel is blind after each event.
-        leak_hz: ON events of a pixel that sees nothing change.
+        refractory_s: dead time of a pixel after each event.
+        leak_hz: rate of ON events of a pixel without any change.
         noise_hz: further events of each pixel, of either polarity, twice as many in the dark.
         hot_share: share of the pixels that fire all the time, at 10 to 300 Hz.
         dark_radiance: apparent radiance of a black pixel: stray light in the lens, and dark current.
@@ -132,10 +132,10 @@ class HandMotion:
     Attributes:
         speed_mps: range of the board's mean speed, redrawn for each capture; from the slowest that gives
             events to the fastest at which a held board is still detected.
-        turn_deg_s: how fast it turns at most at the greatest speed.
+        turn_deg_s: maximum rotation rate at the greatest speed.
         tremor_m: amplitude of the hand's trembling, 5 to 9 Hz.
-        carry_mps: greatest speed on the way from one placement of a recording to the next.
-        rest_s: how long it rests at each placement of a recording.
+        carry_mps: maximum speed between two placements of a recording.
+        rest_s: time of rest at each placement of a recording.
     """
 
     speed_mps: tuple[float, float] = (0.05, 0.3)
@@ -155,18 +155,18 @@ class SimulationOptions:
         camera: the cameras' errors.
         distance_m: range of the board's distance from the camera; no board is placed where the LiDAR would
             see less than four fifths of the plate (a diamond of 1 m nearer than about 1.4 m).
-        roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
+        roll_deg: mean and half-width of the board's rotation in its plane, 0 = upright, 45 = a diamond.
         furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
         truth_rotation_deg, truth_translation_m: maximum distance of the true extrinsics from the profile's
             nominal ones; never more than 0.8 of the profile's tolerances.
-        mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
+        mounting_seed: seed of true extrinsics and sensor errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
-        motion: whether the board is held still or moved by hand; only a moving one makes events.
+        motion: whether the board is held still or moved by hand; only a moving one generates events.
         hand: movement of the person's hand.
         events: errors of cameras with a channel of events; their optics are `camera`'s.
         events_span_s: time that a capture's events cover before and after a scan's timestamp.
         exposure_s: exposure time of a moving board's images.
-        frame_every_s: between the images of a camera that runs freely while the board moves.
+        frame_every_s: interval between the images of a camera that runs freely while the board moves.
         frame_offset_s, event_offset_s: lead of the timestamps of images and of events over the LiDAR's clock,
             which is the rig's.
     """

@@ -87,7 +87,7 @@ class CameraView:
     def count_rings(self, board: Board, T_world_board: Array) -> int:
         """Count the LiDAR's rings with at least a few returns from the board.
 
-        Without rings, a board in the field of view, with a margin, counts as one with enough.
+        Without rings, a board within the field of view, with a margin, counts as having enough.
         """
         if self.model.pattern != "rings":
             return _WANTED_RINGS if self._is_in_view(board, T_world_board) else 0
@@ -135,7 +135,7 @@ def place_board(
     Args:
         view: the sensors that must see the board.
         board: the board.
-        room: the board and its carrier must stand free in it.
+        room: room in which board and carrier must stand free.
         options: ranges of distance and roll.
         index: index of the capture; consecutive ones fill the image evenly.
         rng: source of the tilt and of the next candidates.
@@ -166,7 +166,7 @@ def place_board(
         near, far = options.distance_m
         raise LceRigError(
             f"no place for the board {near:g}-{far:g} m before {view.camera} is seen by {view.lidar}",
-            "Check the nominal extrinsic of the profile, or let the board come nearer or go farther.",
+            "Check the nominal extrinsics of the profile, or let the board come nearer or go farther.",
         )
     return fallback
 
@@ -195,7 +195,7 @@ def _candidate(
 
 
 _N_SWAYS = 4
-#: Distance from the plate's middle at which a trembling hand holds it, m: turns its way into an angle.
+#: Distance of a trembling hand from the plate's middle, m: converts its displacement into a rotation.
 _ARM_M = 0.4
 #: The speed is that of the second before the anchor, whose events form the image.
 _SPEED_WINDOW_S = np.linspace(-1.0, 0.2, 61)
@@ -208,8 +208,8 @@ class Trajectory:
     """The board's pose at any time: still at placements, moving between them, swaying throughout.
 
     Attributes:
-        arrival_ns: (K,) when the board reaches each placement, increasing.
-        departure_ns: (K,) when it leaves each.
+        arrival_ns: (K,) time of arrival at each placement, increasing.
+        departure_ns: (K,) time of departure from each.
         T_world_placement: (K, 4, 4).
         frequency_hz: (M,) of the sways.
         amplitude: (M, 6) of each sway's tangent (translation m, world; rotation rad).

@@ -66,7 +66,7 @@ def build_room(heading_rad: float, rng: np.random.Generator, furnish: Furnish | 
 
     Args:
         heading_rad: azimuth that the first camera looks along, world.
-        rng: source of the room's rotation against the rig, and of its furniture.
+        rng: source of the room's rotation relative to the rig, and of its furniture.
         furnish: draws corners (3,), parts and obstacles of a room from those of the usual one; None keeps it.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
@@ -179,7 +179,7 @@ def _clearance(bodies: Array, board: Board, T_world_board: Array, gap_m: float) 
     """Compute how far bodies must move backwards so that their parts near the plate are `gap_m` behind it.
 
     Args:
-        bodies: (N, 3) points all over them, m, world.
+        bodies: (N, 3) points on their surfaces, m, world.
         board: the board.
         T_world_board: (4, 4).
         gap_m: distance left.

@@ -33,7 +33,7 @@ from lce_rig.simulate.stage import (
 )
 from lce_rig.simulate.subframes import MovingView, film, speed_px_s
 
-# While the shutter is open the board is drawn at moments that lie this far apart in the image at most.
+# Largest motion of the board in the image between two renderings of one exposure, px.
 _SMEAR_STEP_PX = 0.35
 _MOST_MOMENTS = 15
 
@@ -92,9 +92,9 @@ class StagedBoard:
         return Image(camera, channel, stamp_ns, expose(radiance, options.camera, rng), stamp_ns)
 
     def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
-        """Take a scan that begins at a time; every firing meets a moving board at its pose of that moment.
+        """Take a scan that begins at a time; every firing hits a moving board at its pose at that time.
 
-        The carrier stays at its pose of half a revolution.
+        The carrier keeps its pose of mid-revolution.
         """
         stage = self.stage
         T_world_lidar, model, noise = stage.T_world_sensor[lidar], stage.models[lidar], stage.noise[lidar]
@@ -139,13 +139,13 @@ class SimulatedCapture:
 
     Attributes:
         index: index of the capture in its session.
-        images: one a camera that has a channel of frames, in the profile's order.
-        scans: one a LiDAR, in the profile's order.
+        images: one per camera with a channel of frames, in the profile's order.
+        scans: one per LiDAR, in the profile's order.
         T_lidar_board: true (4, 4) by LiDAR, at its scan's timestamp.
         T_cam_board: true (4, 4) by camera, at the middle of its image's exposure; of a camera without
             frames, at the timestamp of the scan it was placed for.
         target: the camera and the LiDAR that the board was placed for; others may not see it.
-        events: one a camera that has a channel of events, if the board moves.
+        events: one per camera with a channel of events, if the board moves.
         trajectory: pose of the board in the world at any time of the rig's clock, the LiDAR's.
         T_world_sensor: (4, 4) of each camera and LiDAR.
     """
@@ -175,7 +175,7 @@ def simulate_captures(
 
     Args:
         rig: the profile.
-        n_captures: how many; the first ones do not depend on this number.
+        n_captures: number of captures; the first ones do not depend on it.
         seed: random seed of truth, room, placements and noise.
         options: `SimulationOptions.for_rig` of the rig by default.
 
@@ -253,10 +253,11 @@ def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOption
     """Return the board's true pose at each sensor's time of measurement.
 
     Returns:
-        `boards`: by sensor `t_ns`, on the rig's clock, and `T_sensor_board` then; `speed_mps` of the board's
-        middle at the time of the LiDAR that it was placed for. A LiDAR's time is the mean firing time of its
-        returns from the board. A camera's is the middle of its image's exposure, or without an image that
-        LiDAR's time.
+        `boards`: `t_ns`, on the rig's clock, and `T_sensor_board` at that time, by sensor; and `speed_mps` of
+            the
+        board's middle at the time of the LiDAR that it was placed for. A LiDAR's time is the mean firing time
+        of its returns from the board. A camera's is the middle of its image's exposure, or without an image
+        that LiDAR's time.
     """
     times_ns = {scan.sensor: board_time_ns(rig, capture, scan) for scan in capture.scans}
     middle_ns = times_ns[capture.target[1]]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _Rows = TypeVar("_Rows", bound="DataclassInstance")
-# The board by eye: a white plate, the linear albedo of black print, and a brown back.
+# Visible appearance of the board: a white plate, the linear albedo of black ink, a brown back.
 PLATE = Material((0.86, 0.87, 0.88), 0.95)
 PRINT_ALBEDO = 0.035
 PLATE_BACK = Material((0.30, 0.38, 0.45), 0.6)
@@ -145,7 +145,8 @@ class Scene:
         moving: surfaces of the board's carrier, which stand elsewhere in each capture.
         board: the board.
         T_world_board: (4, 4).
-        print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
+        print_reflectivity: reflectivity of the dark squares at 905 nm; the ink of LCE-Calib's boards is
+            bright there.
 
     Surfaces are numbered static, then moving, then the board (`board_index`).
     """
@@ -194,7 +195,7 @@ class Scene:
 
     def cast_board(self, origins: Array, directions: Array) -> Hits:
         """Intersect rays with the board's rectangle: p_z + s u_z = 0 in frame board."""
-        # One axis at a time: thrice as fast as a product with the whole rotation.
+        # One axis at a time: three times as fast as a product with the whole rotation.
         axes, centre = self.T_world_board[:3, :3].T, self.T_world_board[:3, 3]
         start_x, start_y, start_z = ((origins - centre) @ axis for axis in axes)
         step_x, step_y, step_z = (directions @ axis for axis in axes)

@@ -48,7 +48,7 @@ class Stage:
         models: models of each LiDAR.
         noise: the sensor's errors.
         laser_bias_m: (L,) range offset of each laser of each LiDAR.
-        pixels: those of each camera with a channel of events.
+        pixels: event pixels of each camera with a channel of events.
         views: pairs of sensors that the board is placed for in turn.
     """
 
@@ -105,9 +105,9 @@ def truth_extrinsics(
 ) -> dict[tuple[str, str], Array]:
     """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR, and of every two LiDARs.
 
-    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that no
-    solver can pass by returning the nominal. Pairs without an entry follow from the others; a camera without
-    any looks along the first LiDAR's x axis.
+    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that a
+    solver cannot pass by returning the nominal ones. Pairs without an entry follow from the others; a camera
+    without any looks along the first LiDAR's x axis.
 
     Args:
         rig: the profile.
@@ -144,7 +144,7 @@ def set_stage(
         kinds = ("frames", "events")
     cameras = [name for name, camera in rig.cameras.items() if any(map(camera.first_channel, kinds))]
     if rig.cameras and not cameras:
-        hint = "Of a board held still, only frames can be simulated: events need motion."
+        hint = "Only frames can be simulated for a board held still: events need motion."
         raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     eyes = [(name, lenses[name], T_world_sensor[name]) for name in cameras]
@@ -241,7 +241,7 @@ def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]
 
     Returns:
         `pairs` of camera, or another LiDAR, and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's
-        alone, and how much more the timestamps of images and events read than the rig's clock, which is the
+        alone, and the excess of the timestamps of images and events over the rig's clock, which is the
         LiDAR's.
     """
     pairs = [

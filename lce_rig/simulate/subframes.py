@@ -111,7 +111,7 @@ class MovingView:
         """
         board, offset_m = self.board, self.board.pattern_offset_m
         if board.has_markers:
-            # No product of waves: the mean of points over the kernel's width.
+            # Markers are no product of waves: average points over the kernel's width.
             shifts = np.sqrt(5) * np.array([-0.6, -0.2, 0.2, 0.6])
             dark = [
                 is_dark(board, np.stack([x + across * spread_x, y + along * spread_y], axis=-1))
@@ -132,9 +132,9 @@ class MovingView:
 
 
 def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> None:
-    """Feed an event camera the motion after start_ns, which it has seen already, up to end_ns.
+    """Feed the motion after start_ns, up to end_ns, to an event camera.
 
-    The steps are short enough that an edge crosses no more than a part of a pixel in each.
+    The steps are so short that edges move by a fraction of a pixel in each.
     """
     t_ns = start_ns
     while t_ns < end_ns:

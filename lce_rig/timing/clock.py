@@ -27,8 +27,8 @@ class ClockModel:
         reference_ns: time on the reference's clock at that moment.
         drift: excess of the reference's rate over the source's, as a fraction: 40e-6 is 40 ppm.
         cov: (2, 2) of the reference's time at the anchor in ns, and of `drift` in ns per ns.
-        bias_sigma_ns: error common to all readings (an answer that is always slower than its request); it
-            leaves no trace in their scatter.
+        bias_sigma_ns: error common to all readings, such as an answer always slower than its request, which
+            their scatter does not contain.
         rms_ns: scatter of the readings about the line.
         first_ns, last_ns: range of the readings on the source's clock.
         n_used: readings the line was fitted to, without outliers.
@@ -51,8 +51,8 @@ class ClockModel:
         """Build the model of a clock that already shows the reference's time.
 
         Args:
-            sigma_ns: how well it does.
-            origin: why, in words: "PPS locked".
+            sigma_ns: standard deviation of that time.
+            origin: the reason, in words: "PPS locked".
         """
         return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, origin)
 
@@ -72,7 +72,7 @@ class ClockModel:
 
             sigma(t)^2 = c00 + 2 c01 dt + c11 dt^2 + bias^2 + (WANDER outside)^2
 
-        with dt from the anchor, and `outside` how far t lies before or after the data.
+        with dt from the anchor, and `outside` the time by which t lies before or after the data.
         """
         elapsed_ns = float(source_ns - self.anchor_ns)
         outside_ns = max(self.first_ns - source_ns, source_ns - self.last_ns, 0)
@@ -118,7 +118,7 @@ def resolve_hour(past_hour_ns: int, near_ns: int) -> int:
 
     Args:
         past_hour_ns: time since the full hour; may exceed an hour where a counter has not wrapped yet.
-        near_ns: about the same moment on a clock that knows the hour, right within half an hour.
+        near_ns: about the same time on a clock with the hour, accurate to half an hour.
 
     Returns:
         The time that is `past_hour_ns` past some hour, and nearest to `near_ns`.

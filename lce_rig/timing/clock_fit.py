@@ -34,14 +34,15 @@ def fit_clock(
 ) -> ClockModel | None:
     """Fit offset and drift to readings of two clocks, without outliers.
 
-    Only the quickest two fifths of the readings are used. The delay of a reading beyond the quickest one,
-    e_i = bound_i - min bound, shifts its middle by up to +-e_i: fully if the delay was all on one way, not at
-    all if both ways shared it equally. The asymmetry a is a third unknown, common to all readings:
+    Only the quickest two fifths of the readings are used. The delay of a reading beyond the quickest one, e_i
+    = bound_i - min bound, shifts its middle by up to +-e_i: fully if the whole delay was in one direction,
+    not at all if both directions shared it equally. The asymmetry a is a third unknown, common to all
+    readings:
 
         reference_i - source_i = offset + drift t_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)
 
     Without it, answers that become slower would look like a drift. The quickest round trip may be asymmetric
-    too, in the same way every time. Such an error does not scatter; it is stated as
+    too, in the same way every time. Such an error does not scatter; it is reported as
     bias_sigma = min bound / sqrt(3).
 
     Args:
@@ -91,9 +92,9 @@ def match_edges(
     """Match edges timestamped by one clock to those of another, by a coarse model of the two.
 
     Args:
-        source_ns: (N,) edges on the one clock; rising.
+        source_ns: (N,) edges on one clock; rising.
         reference_ns: (M,) edges on the other; rising, more than twice the tolerance apart.
-        coarse: from the one clock to the other, right to within the tolerance.
+        coarse: model from one clock to the other, accurate to within the tolerance.
         tolerance_ns: largest accepted deviation.
 
     Returns:
@@ -159,8 +160,8 @@ class LineFit:
     def covariance(self, are_delayed: bool) -> Array:
         """Compute the covariance (2, 2) of offset and drift.
 
-        The errors of edges are independent. Delays persist for a while and then change, so readings of one
-        stretch of time err together. The jackknife over stretches measures this: if its covariance is r > 1
+        The errors of edges are independent. Delays persist for a while and then change, so errors of readings
+        close in time are correlated. The jackknife over stretches measures this: if its covariance is r > 1
         times that of independent readings, the latter is multiplied by r.
 
         References:
@@ -236,8 +237,8 @@ class _Pair(NamedTuple):
 class ClockTracker:
     """Incoming readings of two clocks, and the model fitted to the latest ones.
 
-    A reading far off the model is held back. One alone is forgotten as an outlier; three in a row that agree
-    with each other mean that a clock has jumped, and begin a new model.
+    A reading far from the model is held back. A single one is discarded as an outlier; three in a row that
+    agree with each other mean that a clock has jumped, and start a new model.
 
     Attributes:
         steps: the jumps so far.

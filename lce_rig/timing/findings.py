@@ -16,7 +16,7 @@ IMAGES_WITHOUT_PULSES = Kind(
 AMBIGUOUS_PULSES = Kind(
     "pulses.ambiguous",
     "more than one pulse in {window_ms:.0f} ms could have triggered an image",
-    "begin with slower pulses, or lower sync.triggers.{subject}.max_delay_s",
+    "start with slower pulses, or lower sync.triggers.{subject}.max_delay_s",
 )
 PULSES_NOT_FOLLOWED = Kind(
     "pulses.not_followed", "its images do not follow the pulses", "set the camera to trigger mode"
@@ -24,14 +24,14 @@ PULSES_NOT_FOLLOWED = Kind(
 RESTARTED = Kind("pulses.restarted", "the camera or the sync board restarted its count")
 SLIPPED = note_kind(
     "pulses.slipped",
-    "its images were matched to the pulses anew {n_restarts} times; {n_matched} matched, {n_unmatched} not",
+    "matching images to pulses restarted {n_restarts} times; {n_matched} matched, {n_unmatched} not",
 )
 
-NO_EDGES = Kind("edges.none_seen", "no edges detected yet", "wire its trigger input, and switch it on")
+NO_EDGES = Kind("edges.none_seen", "no edges detected yet", "connect and enable its trigger input")
 EDGES_TOO_CLOSE = Kind(
     "edges.too_close",
     "its clock is uncertain by {sigma_ms:.0f} ms, too much for pulses every {period_ms:.0f} ms",
-    "wire the pulse per second, or begin slower",
+    "connect the PPS line, or start at a lower trigger rate",
 )
 EDGES_NOT_THE_PULSES = Kind(
     "edges.not_the_pulses", "the detected edges are not the board's pulses", "check the wire"

@@ -1,8 +1,8 @@
 """All sensors' timestamps on one clock, synchronised during collection.
 
-With a sync board this clock is UTC as the board has it. A LiDAR locked to the board's pulses is on it
-already. Images are timed by the pulses that triggered them, and an event camera by the edges that it saw. All
-others are converted by the computer's clock and the board's answers. Without a board, all timestamps stay on
+With a sync board this clock is the board's UTC. A LiDAR locked to the board's pulses is already on it. Images
+are timed by the pulses that triggered them, event cameras by the edges that they detected. All others are
+converted by the computer's clock and the board's answers. Without a board, all timestamps stay on
 the computer's clock.
 """
 
@@ -135,7 +135,7 @@ class RigClock:
     """Puts samples onto the rig's clock, for `collect` and `doctor` alike.
 
     Attributes:
-        models: by the sensor's name, from its clock to the rig's; samples placed earlier keep their time.
+        models: model from each sensor's clock to the rig's; samples placed earlier keep their time.
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:
@@ -199,7 +199,8 @@ class RigClock:
         """Set new models.
 
         Args:
-            host_clock, utc_clock: the computer's time and UTC on the board's clock; None where unknown.
+            host_clock, utc_clock: models of the computer's time and UTC on the board's clock; None if
+                unknown.
             locked: LiDARs whose timestamps are UTC by the board's pulses.
         """
         self._host, self._utc = host_clock, utc_clock

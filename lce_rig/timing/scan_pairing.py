@@ -64,9 +64,9 @@ class EventCut:
     """A range of one camera's stream.
 
     Attributes:
-        packets: those with its events, at least one event.
-        start_ns, end_ns: on the events' own clock.
-        offset_ns: added to its timestamps to get the rig's time.
+        packets: packets with its events, at least one event.
+        start_ns, end_ns: bounds on the events' own clock.
+        offset_ns: offset to add to its timestamps to get the rig's time.
         missing_ns: length of its beginning that lies before the stream; 0 if it is complete.
     """
 
@@ -159,7 +159,7 @@ class _Stream:
     """One camera's packets.
 
     Attributes:
-        offset_ns: added to timestamps to get the rig's time.
+        offset_ns: offset to add to timestamps to get the rig's time.
         first_ns, last_ns: timestamps of the first event of all and of the last.
     """
 
@@ -184,7 +184,8 @@ class Frame:
             time (timestamps plus the profile's expected offsets).
         images: the image of each camera channel that has one within the tolerance.
         scans: the scan of the first LiDAR, if there is one, and of each other with one within the tolerance.
-        events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
+        events: events of each event camera, from 1.2 s before the first scan's first firing to 0.15 s after
+            its last.
     """
 
     time_ns: int
@@ -204,7 +205,7 @@ def pair_by_time(
     """Yield each scan of the first LiDAR heard with the nearest image of each camera channel and its events.
 
     For a rig without cameras, yield each with the nearest scans of other LiDARs; without LiDARs, each image
-    of the first camera heard with the nearest ones of others.
+    of the first camera with the nearest ones of others.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or for a
     second. If clocks are set back, waiting samples are dropped.

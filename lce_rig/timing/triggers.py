@@ -2,8 +2,8 @@
 
 A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, found from the
 times of a few images at the start. From then on images are matched by number only, so that a busy computer or
-a lost line cannot mix them up. The camera's timestamps still check the constant: a pulse that the camera
-missed, or a frame that its driver did not number, shifts every later image by whole pulses. The constant is
+a lost line cannot mismatch them. The camera's timestamps are used to check the constant: a pulse missed by
+the camera, or a frame not numbered by its driver, shifts every later image by whole pulses. The constant is
 then determined again.
 """
 
@@ -35,10 +35,10 @@ class TriggeredImage(NamedTuple):
     """An image and the pulse that triggered it.
 
     Attributes:
-        image: as the camera gave it.
+        image: image as received from the camera.
         pulse: running number of the pulse.
-        pulse_ns: its rising edge, board time; between its neighbours' where the pulse's line was lost.
-        stamp_ns: the moment the image shows, board time: the pulse and the camera's usual delay.
+        pulse_ns: board time of its rising edge; interpolated if the pulse's line was lost.
+        stamp_ns: board time of the image: the pulse plus the camera's typical delay.
     """
 
     image: Image

@@ -1,4 +1,5 @@
-"""`lce-rig deploy` killed again and again, into a folder and over ssh: a robot has one whole set, always.
+"""`lce-rig deploy` killed repeatedly, into a folder and over ssh: the robot must always have one complete
+set.
 
 Two results of a session are deployed in turn. Killed are the program alone, the program with all that it has
 started, or what serves it at the other end of the connection. Meanwhile a robot reads the current set as fast
@@ -40,7 +41,7 @@ Content = Mapping[str, str]
 
 @dataclass
 class DeployKillReport(Report):
-    """What became of the robot's files.
+    """State of the robot's files after the kills.
 
     Attributes:
         n_by_kind: kills, by place and by what was killed.
@@ -177,7 +178,7 @@ def _fuzz_robot(
 
 
 def _learn(session: Path, robot: _Robot) -> None:
-    """Deploy each result once, which gives the only contents that may ever be found."""
+    """Deploy each result once, and return the only contents allowed from then on."""
     for k in range(len(_VARIANTS)):
         began_s = time.monotonic()
         process = _deploy(session, robot, k)
@@ -277,7 +278,7 @@ def _deploy(session: Path, robot: _Robot, variant: int) -> "subprocess.Popen[byt
 
 
 def _wait_for_draft(robot: _Robot, process: "subprocess.Popen[bytes]") -> float | None:
-    """Wait until new files appear at the target; gives when, None where the process ends first."""
+    """Wait until new files appear at the target; return the time, None if the process ends first."""
     deadline_s = time.monotonic() + PATIENCE_S
     while process.poll() is None and time.monotonic() < deadline_s:
         if _left(robot.folder):

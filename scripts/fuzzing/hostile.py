@@ -26,7 +26,7 @@ Make = Callable[[Path, Path], list[str]]
 
 
 def add_result(whole: Path) -> None:
-    """Give the session a result, for the verbs that need one."""
+    """Add a result to the session, for the verbs that need one."""
     rig = load_rig(whole / "rig.yaml")
     write_result(
         whole / "calibration" / "result.json", rig.name, [made_calibration(np.eye(4), 1e-6 * np.eye(6))]
@@ -34,7 +34,7 @@ def add_result(whole: Path) -> None:
 
 
 def _pairs(folder: Path, whole: Path) -> Path:
-    """Write three whole pairs, and give the folder."""
+    """Write three intact pairs, and return the folder."""
     recording = folder / "recording"
     for name, file in (("img", "cam.frames.png"), ("pcd", "lidar.pcd")):
         (recording / name).mkdir(parents=True)
@@ -65,7 +65,7 @@ def beside(name: str, write: Callable[[Path], None]) -> Make:
 
 
 def recording(name: str, write: Callable[[Path], None]) -> Make:
-    """Give one bad file as the recording."""
+    """Use one bad file as the recording."""
 
     def make(folder: Path, whole: Path) -> list[str]:
         write(folder / name)
@@ -76,7 +76,7 @@ def recording(name: str, write: Callable[[Path], None]) -> Make:
 
 
 def words(write: Callable[[Path], None], *line: str, name: str = "input.yaml") -> Make:
-    """Give one bad file as an argument, {} in a command line; {rig} and {session} are whole."""
+    """Use one bad file as an argument, {} in a command line; {rig} and {session} are intact."""
 
     def make(folder: Path, whole: Path) -> list[str]:
         write(folder / name)
@@ -143,7 +143,7 @@ def _las(n_vlrs: int = 0, n_points: int = 1, n_evlrs: int = 0) -> bytes:
 
 
 def _jpeg() -> bytes:
-    """Take a JPEG image, and let it claim 65,500 x 65,500 px."""
+    """Change a JPEG image's header to 65,500 x 65,500 px."""
     plain = bytearray(cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes())
     at = plain.index(b"\xff\xc0")
     plain[at + 5 : at + 9] = struct.pack(">HH", 65500, 65500)
@@ -261,7 +261,7 @@ _RUN = "fleet run {session} --workers 1"
 
 
 def _each(what: str, contents: str, line: str, name: str = "input.yaml") -> dict[str, Make]:
-    """Give a file of each content as the same argument of a command line."""
+    """Use a file of each content as the same argument of a command line."""
     return {f"{what}_{of}": words(_CONTENTS[of], *line.split(), name=name) for of in contents.split()}
 
 

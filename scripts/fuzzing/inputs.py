@@ -1,4 +1,4 @@
-"""Hostile inputs given to the program: each has to be refused in time, in little memory, in words."""
+"""Hostile inputs to the program: each must be refused in time, with little memory and a message."""
 
 import os
 import random

@@ -23,12 +23,12 @@ WITHIN_S = 2.0
 _DONE = {"doctor": 5, "repeat": 4}
 _PATIENCE_S = 30.0
 _LONGEST_S = 30.0
-_SAID = "interrupted; what was written so far is whole"
+_SAID = "interrupted; everything written so far is complete"
 
 
 @dataclass
 class InterruptReport(Report):
-    """What became of interrupted programs.
+    """Outcomes of interrupted programs.
 
     Attributes:
         n_over: programs that had ended before the moment.
@@ -93,7 +93,7 @@ class _Bench:
         return copy
 
     def new(self) -> Path:
-        """Name a folder that is not there yet."""
+        """Return the path of a folder that does not exist yet."""
         shutil.rmtree(self.folder / "new", ignore_errors=True)
         return self.folder / "new"
 
@@ -189,7 +189,7 @@ def _interrupt_once(
     report.kinds[verb] += 1
     report.slowest_s[verb] = round(max(took_s, report.slowest_s.get(verb, 0.0)), 2)
     what = f"{verb}, interrupted {'twice ' if twice else ''}after {moment_s:.2f} s"
-    # It may just have been done when the signal came.
+    # It may have finished just before the signal.
     if process.returncode not in (130, _DONE.get(verb, 0)):
         report.wrong.append(f"{what}: it ended with {process.returncode}: {said[-1500:]}")
     elif took_s > WITHIN_S:

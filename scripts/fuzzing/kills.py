@@ -25,11 +25,11 @@ _PATIENCE_S = 300.0
 
 @dataclass
 class KillReport(Report):
-    """What became of the session.
+    """State of the session after the kills.
 
     Attributes:
         n_captures: listed in the end.
-        n_said: captures that were said to be safe before the kill.
+        n_said: captures reported as saved before the kill.
         n_writing: kills while a capture was being written, by the drafts that were left behind.
     """
 
@@ -68,7 +68,7 @@ def fuzz_kills(n: int, seed: int) -> KillReport:
 
 
 def _kill_once(profile: Path, session: Path, chance: random.Random, *, is_at_capture: bool) -> set[str]:
-    """Collect and kill; gives the captures that were said to be safe."""
+    """Collect and kill; return the captures reported as saved."""
     with Collecting(profile, session, "--hold", "0") as collecting:
         if is_at_capture:
             collecting.wait_for("holding: ", _PATIENCE_S)

@@ -1,4 +1,5 @@
-"""Sound files with random damage given to the program: data or an error in words, in time and memory."""
+"""Intact files with random damage: the program must return data or an error message, within limits of time
+and memory."""
 
 import importlib
 import os

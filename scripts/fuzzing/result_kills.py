@@ -1,4 +1,4 @@
-"""`calibrate`, `verify` and `intrinsics` killed again and again: one whole result is on the disk, always.
+"""`calibrate`, `verify` and `intrinsics` killed repeatedly: the disk must always hold one complete result.
 
 Every verb is run in two variants beforehand, to its end, which gives the only contents that may ever be
 found: those of one variant or the other, files that were made together. Killed runs alternate between them.
@@ -58,7 +58,7 @@ VERBS = {
 
 @dataclass
 class ResultKillReport(Report):
-    """What became of the results.
+    """State of the results after the kills.
 
     Attributes:
         n_by_kind: of them, by verb and signal.
@@ -252,7 +252,7 @@ def _kill_once(
         process.wait()
     seconds, text = time.monotonic() - began_s, said(process)
     if number == signal.SIGINT:
-        # Python itself ends with 1 where it is stopped before anything of this program has run.
+        # Python exits with 1 if the signal arrives before any code of lce_rig runs.
         is_ours = process.returncode != 1 or "lce_rig" in text
         if process.returncode not in (0, 130, -signal.SIGINT) and is_ours:
             report.wrong.append(f"{name} ends with {process.returncode} after Ctrl-C: {text[-300:]}")
@@ -288,7 +288,7 @@ def _drafts(session: Path) -> list[str]:
 
 
 def _wait_for_sign(session: Path, process: "subprocess.Popen[bytes]", within_s: float) -> float | None:
-    """Wait until something new appears beside the results; gives when, None where the process ends first."""
+    """Wait until a new file appears beside the results; return the time, None if the process ends first."""
     look = _watch(session)
     before, deadline_s = look(), time.monotonic() + within_s
     while process.poll() is None and time.monotonic() < deadline_s:

@@ -1,4 +1,4 @@
-"""The program started from this checkout, to be killed; what it says is kept."""
+"""The program started from this checkout, to be killed; its output is stored."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ _MAIN = "from lce_rig.cli.main import main; main()"
 
 
 def start(words: list[str], *, in_own_session: bool = False) -> "subprocess.Popen[bytes]":
-    """Start a command line; in a session of its own, it can be killed with all that it has started."""
+    """Start a command line in its own process session, so that it can be killed with its children."""
     environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1"}
     log = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process's object
     process = subprocess.Popen(
@@ -28,7 +28,7 @@ def start(words: list[str], *, in_own_session: bool = False) -> "subprocess.Pope
 
 
 def said(process: "subprocess.Popen[bytes]") -> str:
-    """Read what an ended process has written; once."""
+    """Read the output of an ended process; only once."""
     log = process.said  # type: ignore[attr-defined]
     log.seek(0)
     text: str = log.read().decode(errors="replace")
@@ -37,7 +37,7 @@ def said(process: "subprocess.Popen[bytes]") -> str:
 
 
 def must_end_well(process: "subprocess.Popen[bytes]") -> None:
-    """Wait for a process that nobody kills."""
+    """Wait for a process that is not killed."""
     code = process.wait(PATIENCE_S)
     text = said(process)
     assert code == 0, f"{process.args!r} ended with {code}:\n{text[-2000:]}"

@@ -1,4 +1,4 @@
-"""How far a picture is from the truth: L1, structural similarity and gradients, each weighted per pixel."""
+"""Error of an image: L1, structural similarity and gradients, each weighted per pixel."""
 
 import torch
 from torch import Tensor

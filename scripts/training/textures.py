@@ -1,4 +1,4 @@
-"""Procedural textures: boards with patterns, and what may stand behind them."""
+"""Procedural textures: boards with patterns, and backgrounds."""
 
 import math
 
@@ -23,7 +23,7 @@ X_TEXEL, Y_TEXEL = _grid()
 
 
 def smooth_noise(generator: torch.Generator) -> Tensor:
-    """Make 1/f noise in [0, 1], (T, T): what most rooms look like out of focus."""
+    """Make 1/f noise in [0, 1], (T, T): the appearance of most rooms out of focus."""
     steepness = _uniform(generator, 0.5, 1.3)
     noise = torch.zeros(1, 1, TEXTURE_PX, TEXTURE_PX)
     for size in (3, 6, 12, 24, 48, 96):
@@ -74,7 +74,7 @@ def draw_checkerboard(
     is_light = (torch.floor(u) + torch.floor(v)) % 2 == 0
     is_pattern = (u >= 0) & (u < cols) & (v >= 0) & (v < rows)
     margin = _uniform(generator, 0.0, 1.2)
-    # Boards are mostly white around the print; some are mounted on dark or grey plates.
+    # Boards are mostly white around the pattern; some are mounted on dark or grey plates.
     ground = light if _uniform(generator, 0, 1) < 0.75 else _uniform(generator, 0.05, 0.7)
     texture = torch.where(is_pattern & ~is_light, torch.tensor(dark), torch.tensor(light))
     texture = torch.where(is_pattern, texture, torch.tensor(ground))
@@ -110,7 +110,7 @@ def card(generator: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def foreground(generator: torch.Generator) -> Tensor:
-    """Draw what is held in front of the camera: reflectance and cover, (2, T, T)."""
+    """Draw the object held in front of the camera: reflectance and cover, (2, T, T)."""
     kind = _uniform(generator, 0, 1)
     if kind < 0.45:
         texture, cover = checkerboard(generator)
@@ -125,7 +125,7 @@ def foreground(generator: torch.Generator) -> Tensor:
 
 
 def soften(textures: Tensor) -> Tensor:
-    """Blur by about one texel, so that sampling at up to two texels a pixel does not alias."""
+    """Blur by about one texel, so that sampling at up to two texels per pixel does not alias."""
     kernel = torch.tensor([0.25, 0.5, 0.25], device=textures.device)
     n = textures.shape[1]
     padded = F.pad(textures, (1, 1, 1, 1), mode="replicate")

@@ -18,7 +18,7 @@ from lce_rig.lens.models import model_of
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 CAMERA = Intrinsics(897.0, 897.0, 639.5, 359.5, 1280, 720, "radtan", (-0.44, 0.23, -0.001, 0.0002, -0.07))
-# Camera looking along the LiDAR's x axis, turned by some degrees about every axis.
+# Camera looking along the LiDAR's x axis, rotated by some degrees about every axis.
 T_FORWARD = pose(
     project_to_so3(np.array([[0.777, -0.629, 0.007], [0.006, -0.003, -1.0], [0.629, 0.777, 0.002]])),
     np.array([-0.008, -0.069, -0.084]),
@@ -27,7 +27,7 @@ T_FORWARD = pose(
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated: noise, beam, and how the board is held."""
+    """Settings of the simulation: noise, beam, and the board's poses."""
 
     range_sigma_m: float = 0.01
     laser_bias_sigma_m: float = 0.0
@@ -93,7 +93,7 @@ def random_pose(rng, scenario, board):
 
 
 def photograph(T_cam_board, rng, scenario, board):
-    """Measure the corners with noise and solve for both poses; None where the board leaves the picture."""
+    """Measure the corners with noise and solve for both poses; None if the board leaves the image."""
     pixels, is_valid = CAMERA.project(transform(T_cam_board, board.corners()))
     if not (is_valid.all() and CAMERA.is_inside(pixels, 3.0).all()):
         return None
@@ -123,7 +123,7 @@ def scan_board(T_lidar_board, rng, scenario, board, bias_m=0.0):
     )
     ranges = (R[:, 2] @ centre) / (rays @ R[:, 2])
     on_board = (rays * ranges[..., None] - centre) @ R
-    # A beam so wide meets the board from that far beyond an edge, farther along a board seen obliquely.
+    # A beam of this width still hits the board this far beyond an edge, farther along a board seen obliquely.
     wide = scenario.footprint_m * np.hypot(1, (rays @ R)[..., :2] / (rays @ R)[..., 2:])
     half = np.array([board.width_m, board.height_m]) / 2 + wide
     if scenario.end_sigma_m > 0:
@@ -169,7 +169,7 @@ def scan_board(T_lidar_board, rng, scenario, board, bias_m=0.0):
 
 
 def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
-    """What a detector says of a plate; by default it does not know its size."""
+    """A detector's figures of a plate; by default without its size."""
     return LidarQuality(
         width_m=width_m,
         height_m=height_m,
@@ -188,7 +188,7 @@ def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
 
 
 def with_decoy(item, decoy, *, is_first):
-    """Add a rival to the LiDAR's candidates."""
+    """Add a decoy to the LiDAR's candidates."""
     places = (decoy, *item.places) if is_first else (*item.places, decoy)
     return replace(item, surface=places[0], others=places[1:])
 

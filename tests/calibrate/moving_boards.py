@@ -1,4 +1,4 @@
-"""Boards on their way before a LiDAR and the two channels of one camera, whose clocks may be off."""
+"""Moving boards before a LiDAR and the two channels of one camera, with clock errors."""
 
 from dataclasses import dataclass, replace
 

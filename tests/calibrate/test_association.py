@@ -31,7 +31,7 @@ def mirrored(item, side=ACROSS):
 
 
 def dealt(captures, sources):
-    """Give every capture the image of another."""
+    """Assign to every capture the image of another."""
     images = [captures[k].image for k in sources]
     return [replace(item, pose=image) for item, image in zip(captures, images, strict=True)]
 

@@ -1,4 +1,4 @@
-"""The right pairs are found among decoys, misdetections and ambiguous poses, however sensors are mounted."""
+"""The correct pairs are found among decoys, misdetections and ambiguous poses, for any mounting."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_consensus_static_decoy_is_not_taken():
 
 
 def test_consensus_many_rivals_are_rejected():
-    """Every capture has three rivals, and every third capture lacks the board."""
+    """Every capture has three decoys, and every third capture lacks the board."""
     captures = []
     for k, item in enumerate(simulate(15, seed=2)):
         rivals = [somewhere_else(1000 + 3 * k + j) for j in range(3)]

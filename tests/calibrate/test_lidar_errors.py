@@ -30,7 +30,7 @@ def observations(seed, part, T):
 
 
 def measured(seed):
-    """Two sessions of one LiDAR, between which it was mounted anew."""
+    """Two sessions of one LiDAR, between which it was remounted."""
     sessions = [observations(seed, slice(0, 8), T_FORWARD), observations(seed, slice(8, 16), T_MOVED)]
     return estimate_lidar(sessions, BOARD, [T_FORWARD, T_MOVED], OPTIONS)
 

@@ -1,4 +1,4 @@
-"""Recordings by others: the extrinsic against their reference, which the algorithm never sees."""
+"""Recordings by others: the extrinsics compared with their reference, which the algorithm does not use."""
 
 import json
 from pathlib import Path

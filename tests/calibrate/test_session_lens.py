@@ -1,4 +1,4 @@
-"""The session's lens: weighed between profile and images, untouched by the LiDAR, with a joint covariance."""
+"""The session's lens: estimated from profile and images, without the LiDAR, with a joint covariance."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Range errors that all captures share: what they do to the solution, and whether the covariance says so."""
+"""Range errors common to all captures: their effect on the solution, and on the covariance."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Errors of the profile's lens and board: what they do to a solution and to its covariance."""
+"""Errors of the profile's lens and board: their effect on a solution and its covariance."""
 
 from dataclasses import replace
 from functools import cache

@@ -57,7 +57,7 @@ assert len(ADVISED) > 20
 
 
 def _lacking(command):
-    """Say what a command lacks to be run as it is typed; "" if nothing."""
+    """Return the reason why a command cannot be run as typed; "" if it can."""
     words = [word for word in shlex.split(command) if word != "\\"]
     at = cli
     context = click.Context(cli, info_name="lce-rig")
@@ -137,7 +137,7 @@ _PLACEHOLDER = re.compile("X|R|RIG|FILE|FOLDER|NAME|TARGET|ROOT|SESSION|OTHER_SE
 
 
 def _typed(command):
-    """Put names of the workbench where an advised command has placeholders."""
+    """Replace the placeholders of an advised command by test values."""
     words = shlex.split(command)
     first = " ".join(words[:2])
     typed = []

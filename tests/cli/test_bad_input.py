@@ -1,4 +1,4 @@
-"""Wrong specifications and hostile recordings: each is named, and nothing wrong is handed out."""
+"""Wrong specifications and hostile recordings: each is named, and no wrong result is returned."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ from lce_rig.simulate.surfaces import rectangle
 
 
 def edit_profile(session, **changes):
-    """Change keys of the session's profile, as somebody who measured the rig wrongly would have them."""
+    """Change keys of the session's profile, as after a wrong measurement of the rig."""
     path = session / "rig.yaml"
     document = yaml.safe_load(path.read_text())
     for key, value in changes.items():
@@ -32,7 +32,7 @@ def edit_profile(session, **changes):
 
 
 def keep(session, n_captures):
-    """Take all but the first captures away, where what is said of one is said of all."""
+    """Keep only the first captures, if the findings about one are those about all."""
     for capture in Session.open(session).captures[n_captures:]:
         shutil.rmtree(capture.path)
 

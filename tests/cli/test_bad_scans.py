@@ -1,4 +1,4 @@
-"""Boards that scans do not show as they should: refused or marked with their cause, never a wrong pass.
+"""Boards badly visible in scans: refused or marked with the cause, never a wrong pass.
 
 Most captures are of a simulated Mid-360, whose scans are accumulated for a second.
 """
@@ -74,7 +74,7 @@ def assert_is_within_its_claim(session):
 
 
 def turned(scan, deg_s):
-    """Turn a LiDAR about its axis while it scans."""
+    """Rotate a LiDAR about its axis while it scans."""
     angle = np.radians(deg_s) * 1e-9 * scan.offset_ns
     x, y, z = scan.points.T
     points = [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z]
@@ -161,7 +161,7 @@ def test_board_half_out_of_view_is_refused(lce_rig, spoil):
 @pytest.mark.long
 @pytest.mark.parametrize(("has_dust", "has_tags"), [(True, True), (False, False), (True, False)])
 def test_clouds_without_tags_are_used_whole(lce_rig, standing, tmp_path, has_dust, has_tags):
-    """Dust before everything makes a tenth of the returns; tags say which."""
+    """Dust before everything makes a tenth of the returns; tags mark them."""
     source, folder, rng = Session.open(standing / "session"), tmp_path / "folder", np.random.default_rng(0)
     for name in ("img", "pcd"):
         (folder / name).mkdir(parents=True)

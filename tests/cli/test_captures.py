@@ -15,7 +15,7 @@ def test_captures_rejected_until_restored(lce_rig, calibrated):
     before = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
     name = before["captures_used"][0]
     assert listed(lce_rig, calibrated)[name]["used_by"] == [before["camera"]]
-    # Leading zeros may be left away.
+    # Leading zeros may be omitted.
     assert lce_rig("captures", calibrated, "--reject", str(int(name)), "--reason", "a mirror").code == 0
     assert listed(lce_rig, calibrated)[name]["state"] == "rejected"
     assert name not in json.loads(lce_rig("check", calibrated, "--json").out)["pairs"][0]["captures"]

@@ -1,4 +1,4 @@
-"""`lce-rig collect` from recordings with raw events: what it captures, and what it says where it cannot."""
+"""`lce-rig collect` from recordings with raw events: captures, and messages without any."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A LiDAR's bag, and files of the DAVIS beside it: sound, of another time, of another camera, empty."""
+    """A LiDAR's bag, and files of the DAVIS beside it: intact, of another time, of another camera, empty."""
     path = tmp_path_factory.mktemp("recordings")
     moves.bag(path / "lidar.bag", moves.without(Image, Events))
     frames = [s for s in moves.samples() if isinstance(s, Image)]

@@ -1,4 +1,4 @@
-"""Folders of pictures of a rig with two cameras: whose they are is said, never guessed."""
+"""Folders of images of a rig with two cameras: the camera must be named, and is never guessed."""
 
 import json
 from pathlib import Path

@@ -117,7 +117,7 @@ def test_collect_killed_early_no_traceback(tmp_path):
         process = start(tmp_path / number.name, "--plain", start_new_session=True)
         assert "starting" in process.stderr.readline()
         time.sleep(0.5)
-        os.killpg(process.pid, number)  # as a terminal does: to the simulation, too
+        os.killpg(process.pid, number)  # like a terminal, also to the simulation
         _, said = process.communicate(timeout=180)  # until the simulation has closed its end, too
         assert process.returncode in (130, -number) and "Traceback" not in said
 
@@ -141,7 +141,7 @@ def test_collect_closed_terminal_stops(tmp_path, term):
             if select.select([ours], [], [], 0.5)[0]:
                 said += os.read(ours, 65536)
         os.close(ours)
-        process.send_signal(signal.SIGHUP)  # as the kernel does where it is the controlling terminal
+        process.send_signal(signal.SIGHUP)  # like the kernel for the controlling terminal
         process.wait(timeout=180)
     finally:
         process.kill()

@@ -56,7 +56,7 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     with attach(attached, tmp_path) as reached:
         path = tmp_path / "rig.yaml"
         path.write_text(dump_rig(reached.model_copy(update={"sync": None})))
-        for duration_s in ("2", "6", "18"):  # longer where a computer that is busy with others sends too late
+        for duration_s in ("2", "6", "18"):  # longer, as a busy computer may send too late
             done = lce_rig("doctor", "--rig", path, "--duration", duration_s, "--explain")
             if done.code == 0:
                 break

@@ -1,4 +1,4 @@
-"""Captures with raw events, as a user sees them: check, its pictures, verify, and rigs."""
+"""Output of check, verify and rigs for captures with raw events."""
 
 import json
 from dataclasses import replace

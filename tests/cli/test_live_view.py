@@ -83,7 +83,7 @@ def test_live_view_long_text_is_not_cut(width, height):
     """A wide terminal has a larger drawing."""
     lines = drawn(SAID, width=width, height=height)
     assert len(lines) <= height and max(len(line) for line in lines) <= width
-    # Beside each other stand the streams' columns, and the bars and the drawing.
+    # The streams' columns are side by side, as are bars and drawing.
     words = " ".join(" ".join(lines).split())
     for sentence in (SAID.detail, *SAID.notes, SAID.log[-1], SAID.goes_on):
         assert sentence in words
@@ -115,7 +115,7 @@ def test_bell_rings_once_for_capture_twice_for_refusal():
     twice = heard(STATE._replace(cues=(Cue(2, "refused"),)))
     assert len(twice) == 2 and twice[1] - twice[0] >= 0.2 - 1e-9
     assert heard(STATE._replace(cues=(Cue(3, "tick"),))) == []
-    # What came last counts: a capture right after a refused one must not be heard as refused.
+    # The last sound counts: a capture right after a refused one must not sound refused.
     assert len(heard(STATE._replace(cues=(Cue(1, "refused"), Cue(2, "captured"))))) == 1
     assert heard(STATE, is_silent=True) == []
 
@@ -144,7 +144,7 @@ def test_plain_lines_report_each_change_once(capsys):
     view.show(moving._replace(elapsed_s=79.0, headline="20 cm left", detail="2 rings"))
     captured = {"cues": (Cue(1, "captured"),), "log": ("01:19 captured 000001",), "n_logged": 1}
     view.show(moving._replace(elapsed_s=79.1, headline="20 cm left", **captured))
-    # A message without a sound, such as a sensor that is back, is said as well.
+    # A message without a sound, such as a reconnected sensor, is printed as well.
     told = ("01:19 captured 000001", "01:19 lidar is back")
     view.show(moving._replace(elapsed_s=79.2, phase="ended", headline="over", log=told, n_logged=2))
     out, err = capsys.readouterr()

@@ -80,7 +80,7 @@ sys.exit(run(words))
 
 @pytest.mark.realtime
 def test_main_interrupt_in_open3d_exits_130(tmp_path):
-    # Stopped in its initialisation, it would complain of lost memory and end the process with 1.
+    # Interrupted during initialisation, it would report a lack of memory and exit with 1.
     words = ["open3d.pybind", "0.2", "simulate", "--rig", "rles", tmp_path / "session", "--captures", "1"]
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
     assert done.returncode == 130

@@ -1,4 +1,4 @@
-"""The limit of memory: a file that demands more is refused by name, at once."""
+"""The memory limit: a file that needs more is refused by name at once."""
 
 import subprocess
 import sys

@@ -60,7 +60,7 @@ def test_reconstruct_part_matches_whole(lce_rig, tmp_path):
     assert set(part) <= set(whole)
     twin = tmp_path / "whole" / f"{whole.index(first_ns):06d}.png"
     a, b = (cv2.imread(str(file)).astype(int) for file in (twin, tmp_path / "part" / "000000.png"))
-    # Warmed up on other events, cut into other windows: alike, not the same.
+    # Warmed up with other events and windows: similar, not equal.
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.7
 
 

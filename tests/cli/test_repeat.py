@@ -101,7 +101,7 @@ def test_repeat_shared_data_makes_sessions_dependent(lce_rig, made, tmp_path):
 
 
 def test_repeat_other_rig_or_lens_is_refused(lce_rig, made):
-    """Another board gives a note only."""
+    """Another board only gives a note."""
     a = made("monday", [0] * 6)
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
     refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))

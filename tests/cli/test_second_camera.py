@@ -1,4 +1,4 @@
-"""A rig with a second camera of which the session holds nothing: it is said, and can be left out."""
+"""A rig with a second camera without captures: it is reported, and can be omitted."""
 
 import json
 import shutil

@@ -182,7 +182,7 @@ def test_calibrate_far_from_nominal_fails(lce_rig, session):
     del nominal["quaternion_wxyz"]
     nominal["rpy_deg"] = [0.0, 0.0, 0.0]
     profile.write_text(yaml.safe_dump(document))
-    # How such rigs are built is no test of this one; its own CAD model is.
+    # Typical values do not test this rig; its own CAD model does.
     assert lce_rig("calibrate", session).code == 0
     nominal["source"] = "cad"
     profile.write_text(yaml.safe_dump(document))

@@ -90,7 +90,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig, tmp_path):
     assert (capture.image_keys, capture.event_cameras) == ([], ["davis"])
     outcome = lce_rig(*words, tmp_path / "t", "--motion", "still")
     assert outcome.code == 3
-    assert "only frames" in outcome.err and not any((tmp_path / "t").glob("captures/*"))
+    assert "Only frames" in outcome.err and not any((tmp_path / "t").glob("captures/*"))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_simulate_bad_choices_exit_with_2(lce_rig, tmp_path, monkeypatch, words)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A quarter of a second as files."""
+    """A recording of a quarter of a second."""
     folder = tmp_path_factory.mktemp("recorded")
     profile = write_profile(folder, "frames", "events")
     words = ["--rig", profile, "--recording", folder / "r", "--duration", 0.25, "--seed", 2]
@@ -120,7 +120,7 @@ def recorded(tmp_path_factory):
     return folder / "r"
 
 
-def test_a_recording_is_read_by_the_readers_of_recordings(recorded, rig):
+def test_simulated_recording_is_readable(recorded, rig):
     assert sorted(path.name for path in recorded.iterdir()) == ["recording.bag", "truth.json"]
     recording = open_recording(recorded / "recording.bag", rig)
     samples = list(recording.samples())

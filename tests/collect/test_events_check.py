@@ -1,4 +1,4 @@
-"""Events turned, inverted or late against the frames of the same camera."""
+"""Events rotated, inverted or late relative to the frames of the same camera."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A continuous recording is cut where the board stands still and differs from what is there."""
+"""Captures from a continuous recording: at still boards in new placements."""
 
 import shutil
 
@@ -83,7 +83,7 @@ def test_moving_board_is_never_captured(tmp_path, write_bag, rig):
     bag = write_bag(tmp_path / "a.bag", [0, 1, 2, 3] * 3)
     with Session.create(tmp_path / "s", rig) as session:
         assert collect(session, [open_recording(bag, rig)]).captured == []
-    # A hand never holds a board quite still: the profile says how much is still enough.
+    # Hands are never quite still: the profile sets the limit.
     loose = changed(rig, quality__max_motion_m=5.0)
     with Session.create(tmp_path / "loose", loose) as session:
         assert collect(session, [open_recording(bag, loose)]).captured

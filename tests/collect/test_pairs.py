@@ -1,4 +1,4 @@
-"""Folders of pairs become captures, each once, and whatever is wrong with one spoils no other."""
+"""Folders of pairs become captures, each once; a faulty pair does not affect others."""
 
 import os
 import signal

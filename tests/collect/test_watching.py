@@ -1,4 +1,4 @@
-"""The board followed in scans: seldom searched for while nothing is lost, at once where something is."""
+"""Tracking the board in scans: rare searches while it is tracked, at once after a loss."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ T0_NS = 1_700_000_000_000_000_000
 
 
 def frame_of(k, time_s):
-    """Give what the sensors saw of a placement, as at another time."""
+    """Return the samples of a placement with another time."""
     capture = placements()[k]
     return Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans)
 
@@ -29,7 +29,7 @@ def see(watcher, k, time_s):
 
 
 def nearest_m(detection, k):
-    """Tell how far the nearest candidate lies from where the picture has the board."""
+    """Return the distance of the nearest candidate from the board's pose in the image."""
     (image,) = detection.images.values()
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
@@ -70,7 +70,7 @@ def test_tracker_reports_lens_misfit_not_missing_board():
 
 
 def strict(**limits):
-    """Give the rig with other limits on boards."""
+    """Return the rig with other limits on boards."""
     return changed(rig(), quality=changed(rig().quality, **limits))
 
 

@@ -11,7 +11,7 @@ from lce_rig.core.errors import ProfileError, SourceError
 
 
 class Adder:
-    """Sums what it is given, and remembers it."""
+    """Keeps a running sum of its arguments."""
 
     def __init__(self, first):
         self.total = first

@@ -72,7 +72,7 @@ def test_unpacking_stops_a_recording_that_swells(tmp_path):
             pass
 
 
-def test_decoding_refuses_what_a_header_promises():
+def test_decoding_refuses_oversized_headers():
     with decoding(), pytest.raises(MemoryError):
         np.ones(1 << 28)
     assert np.ones(1 << 20).all()

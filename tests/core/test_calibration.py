@@ -204,7 +204,7 @@ def test_findings_of_another_version_keep_their_words(tmp_path):
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_result_damaged_gives_session_error(tmp_path, data):
-    """Any beginning and any flipped bit: a result or a SessionError."""
+    """Any truncation and any flipped bit: a result or a SessionError."""
     path = tmp_path / "result.json"
     path.write_bytes(data.draw(damaged(as_text(full()).encode())))
     try:

@@ -20,7 +20,7 @@ CAMERAS = pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE], ids=["pi
 @CAMERAS
 @given(st.floats(0.12, 0.88), st.floats(0.12, 0.88), st.floats(0.3, 30.0))
 def test_projecting_a_pixels_ray_gives_the_pixel(camera, u, v, distance_m):
-    # The border is left out: this radtan polynomial folds before it reaches the picture's corners.
+    # Without the border: this radtan polynomial folds before the image's corners.
     pixel = np.array([u * (camera.width_px - 1), v * (camera.height_px - 1)])
     projected, is_valid = camera.project(camera.unproject(pixel) * distance_m)
     assert is_valid

@@ -1,4 +1,4 @@
-"""The table of LiDAR models: whole, found by any spelling, and in agreement with Velodyne's own files."""
+"""The table of LiDAR models: completeness, spellings of names, and agreement with Velodyne's own files."""
 
 from pathlib import Path
 

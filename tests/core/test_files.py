@@ -1,4 +1,4 @@
-"""Files of samples: exact there and back; damaged ones say what is wrong with them."""
+"""Files of samples: exact round trips; errors of damaged files name the fault."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Every action that a caller names is one of its kind, and has the figures that its words take."""
+"""Every action named by a caller exists in its kind, and has the figures of its text."""
 
 import ast
 import string

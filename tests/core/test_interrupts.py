@@ -14,7 +14,7 @@ from lce_rig.core.interrupts import EXIT_INTERRUPTED, GRACE_S, INTERRUPTED
 pytestmark = pytest.mark.realtime
 # Patience with a process on a busy machine, s; shorter than the programs' own waits.
 SOON_S = 20.0
-# What the installed command does; `busy` stands for a verb.
+# Like the installed command, with `busy` as the verb.
 PROGRAM = """
 import signal, sys, time
 from concurrent.futures import ThreadPoolExecutor
@@ -67,7 +67,7 @@ def running(busy):
 
 
 def press_until_it_ends(process):
-    """Press again and again; presses that come at once count as one."""
+    """Press repeatedly; simultaneous presses count as one."""
     pressed_s = time.monotonic()
     while process.poll() is None:
         assert time.monotonic() < pressed_s + SOON_S

@@ -1,4 +1,4 @@
-"""PCD files: exact there and back, as any writer makes them; damaged ones say what is wrong with them."""
+"""PCD files: exact round trips, files of other writers; errors of damaged files name the fault."""
 
 import struct
 from contextlib import suppress
@@ -150,6 +150,6 @@ def test_decode_pcd_promises_beyond_the_file_are_refused(encoding, old, new):
         (XYZ + b"1,0 2,0 3,0\n4,0 5,0 6,0\n", "not rows of 3 numbers"),
     ],
 )
-def test_decode_pcd_names_what_is_wrong(file, message):
+def test_decode_pcd_names_the_fault(file, message):
     with pytest.raises(ValueError, match=message):
         decode_pcd(file)

@@ -1,4 +1,4 @@
-"""Poses of a planar board from one picture, judged by truth, by Monte Carlo and by symmetry."""
+"""Poses of a planar board from one image, compared with truth, Monte Carlo and symmetry."""
 
 import numpy as np
 import pytest

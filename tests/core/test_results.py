@@ -1,4 +1,4 @@
-"""Boards by two sensors: which of them is an image or a scan is checked where it is needed."""
+"""Boards of two sensors: access to an image or a scan checks the kind of sensor."""
 
 import numpy as np
 import pytest

@@ -53,7 +53,7 @@ def test_find_rig_poses_propagates_each_covariance(uncertain):
 def test_find_rig_poses_skips_failed_pairs():
     given = [pair("left", "front"), pair("right", "front", verdict="fail")]
     assert [each.sensor for each in find_rig_poses(given, LIDARS).sensors] == ["left"]
-    # Another pair that has not failed gives its pose.
+    # Its pose follows from another pair that has not failed.
     given += [pair("front", "rear"), pair("right", "rear", verdict="marginal")]
     verdicts = {each.sensor: each.verdict for each in find_rig_poses(given, LIDARS).sensors}
     assert verdicts == {"rear": "pass", "left": "pass", "right": "marginal"}

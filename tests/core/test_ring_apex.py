@@ -1,4 +1,4 @@
-"""Rings seen from another frame than their LiDAR's meet elsewhere than in its origin."""
+"""In a frame other than the LiDAR's, the apex of the rings is not at the origin."""
 
 import numpy as np
 import pytest

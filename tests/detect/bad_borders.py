@@ -1,4 +1,4 @@
-"""Boards whose border is not seen whole: hidden, smeared, or merged with what they stand on."""
+"""Boards with an incomplete border: hidden, smeared, or merged with their stand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _ROOM_M = 13.0
 
 @dataclass(frozen=True, eq=False)
 class Ragged:
-    """The board with a border that lies elsewhere for each ring, or for each ray."""
+    """The board with a border displaced for each ring, or for each ray."""
 
     T_lidar_plate: Array
     by_ring: bool
@@ -48,7 +48,7 @@ def whole(seed: int, has_rings: bool) -> tuple[list[Shape], Array]:
 
 
 def hidden(seed: int, has_rings: bool) -> tuple[list[Shape], Array]:
-    """Hide one side, and 3 to 12 cm of the plate there, by something in front of it."""
+    """Hide one side, and 3 to 12 cm of the plate there, by an object in front of it."""
     rng = np.random.default_rng(seed)
     T = _hung(rng, has_rings)
     side, hidden_m, nearer = rng.integers(4), rng.uniform(0.03, 0.12), rng.uniform(0.7, 0.92)

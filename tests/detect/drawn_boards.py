@@ -18,7 +18,7 @@ FISHEYE = Intrinsics(590.0, 590.0, 480.0, 305.0, 960, 604, "equidistant", (-0.05
 
 
 def looking(tilt_deg, about_deg, roll_deg, centre):
-    """Place the board at `centre`; roll 0 shows the print upright."""
+    """Place the board at `centre`; roll 0 shows the pattern upright."""
     about, roll = np.radians([about_deg, roll_deg])
     tilt = exp_so3(np.radians(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))
     upright = np.diag([1.0, -1.0, -1.0]) @ exp_so3(np.array([0.0, 0.0, roll]))

@@ -117,7 +117,7 @@ def cut(events, n_batches, seed=0):
 
 
 def noise(rate_hz=0.5, duration_s=1.4, seed=1):
-    """Make events anywhere, of either polarity, so many a second and pixel."""
+    """Generate events of either polarity at a rate per second and pixel, anywhere."""
     rng = np.random.default_rng(seed)
     n = round(rate_hz * duration_s * WIDTH_PX * HEIGHT_PX)
     t_us = rng.integers(0, round(duration_s * 1e6), n)
@@ -127,7 +127,7 @@ def noise(rate_hz=0.5, duration_s=1.4, seed=1):
 
 
 def lamps(frequency_hz, duration_s=1.4, n_each=600):
-    """Make all pixels brighten in one half of each period, and darken in the other."""
+    """Let all pixels brighten in one half of each period, and darken in the other."""
     rng = np.random.default_rng(0)
     half_ns = round(0.5e9 / frequency_hz)
     start_ns = np.repeat(np.arange(0, round(duration_s * 1e9), half_ns), n_each)

@@ -131,7 +131,7 @@ def cast(
     """Cast one revolution, in order of firing, clockwise as a VLP-16 turns.
 
     Args:
-        shapes: what the beams meet; nothing where they meet nothing.
+        shapes: surfaces; beams that hit none return nothing.
         sigma_m: noise of a range.
         seed: of noise and of the phase of the rotor.
         elevations_deg: of the lasers, from the lowest up.

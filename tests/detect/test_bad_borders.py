@@ -1,4 +1,4 @@
-"""Boards whose border is not seen whole are used, and each place on the border is as true as it claims."""
+"""Boards with an incomplete border are used, and errors of border points agree with their deviations."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_sharp_border_has_no_further_noise(has_rings: bool) -> None:
 
 @pytest.mark.parametrize("border", ["on a bar", "on the floor"])
 def test_side_on_a_stand_has_no_ends_on_it(border: str) -> None:
-    """Nothing tells where the plate ends in what it merges with."""
+    """The plate's end within a merged surface is undetermined."""
     for board, T in boards(border, has_rings=False):
         on_board = transform(invert(T), board.edge_points)
         is_lower = on_board[:, 1] < -BOARD.height_m / 2 + 0.03

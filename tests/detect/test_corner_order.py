@@ -1,4 +1,4 @@
-"""Of the poses that an image of a board admits, the one nearest to another image's is taken."""
+"""Choice of the pose nearest to another image's, among those that fit an image of a board."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def solved(board, corners_px):
 @pytest.mark.parametrize(("board", "n_quarters"), [(OBLONG, 2), (SQUARE, 1), (SQUARE, 2), (SQUARE, 3)])
 def test_turned_board_has_the_same_pose(board, n_quarters):
     reference = seen(board, looking(), 0.1)
-    # A tenth of a second later the board has moved and turned a little.
+    # A tenth of a second later the board has moved and rotated a little.
     later = seen(board, perturb(looking(), np.array([0.02, 0.01, 0.0, 0.05, -0.04, 0.03])), 0.1, seed=1)
     turned = np.rot90(later.corners_px.reshape(board.rows, board.cols, 2), n_quarters).reshape(-1, 2)
     from_elsewhere = solved(board, turned)

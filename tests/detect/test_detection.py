@@ -1,4 +1,4 @@
-"""Detections survive the way into arrays and back."""
+"""Round trip of detections through arrays."""
 
 import numpy as np
 import pytest

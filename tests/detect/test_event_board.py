@@ -53,7 +53,7 @@ def find(events, stamp_ns=STAMP, limits=LIMITS, **more):
 
 
 def truth_m(stamp_ns):
-    """Where the board's middle is in the camera's x and y."""
+    """Position of the board's middle in the camera's x and y."""
     return STEADY.shift_px(stamp_ns * 1e-9) / FOCAL_PX * DEPTH_M
 
 
@@ -87,7 +87,7 @@ def test_events_are_counted_on_the_board_only(stream, detection):
     quality = detection[1].events
     on_board = (BOARD.width_m * BOARD.height_m) * (FOCAL_PX / DEPTH_M) ** 2
     recent = stream.between(STAMP - 100 * MS, STAMP)
-    # Nothing but the board makes events here, less 0.3 noise events a second and pixel.
+    # Only the board generates events here, apart from 0.3 noise events per second and pixel.
     assert quality.events_px_s * on_board == pytest.approx(len(recent) / 0.1, rel=0.1)
     assert quality.events_px > 3
 
@@ -128,7 +128,7 @@ def test_hot_pixels_do_not_hide_the_board(stream):
         ({"min_event_contrast": 300.0}, "image.low_contrast", "min_contrast"),
     ],
 )
-def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code, figure):
+def test_profile_limits_refuse_with_their_figures(detection, limit, code, figure):
     limits = LIMITS.model_copy(update=limit)
     board = find_image_board(detection[0], BOARD, CAMERA, limits=limits, is_from_events=True)
     if isinstance(board, ImageBoard):

@@ -165,7 +165,7 @@ def test_image_board_cut_by_border_is_reported():
     pixels = draw(SYMMETRIC, shifted, looking(5, 0, 5, (0.0, 0.0, 1.8)))
     refusal = refused(pixels, SYMMETRIC, shifted)
     assert (refusal.code, refusal.figures["side"]) == ("image.cut_off", "right")
-    # A part of a pattern says nothing about the number of its corners.
+    # A part of a pattern does not determine the number of its corners.
     assert "n_cols_seen" not in refusal.figures
 
 
@@ -199,7 +199,7 @@ def test_image_board_other_size_is_refused():
 
 
 def test_image_board_margin_changes_nothing():
-    """Nor does a readout that is cut short."""
+    """A readout that is cut short does not either."""
     pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
     padded = np.full((480, 640), 128, np.uint8)
     padded[:260, :346] = pixels

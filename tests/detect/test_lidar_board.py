@@ -1,4 +1,4 @@
-"""The board in full scans of a room: where it is, what is measured of it, and what is not taken for it."""
+"""The board in full scans of a room: its pose, its figures, and false candidates."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def test_board_at_scan_seam_is_complete(start_deg):
 
 
 def rotated_about_z(scan, deg):
-    """Give the same returns in the frame of a LiDAR that is mounted with another yaw."""
+    """Return the same returns in the frame of a LiDAR mounted with another yaw."""
     c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
     return replace(
         scan, points=(scan.points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).astype(np.float32)

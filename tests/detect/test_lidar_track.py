@@ -50,7 +50,7 @@ def test_predicted_without_board_is_refused():
     for shapes in (room(5.4), room(13.0), [board_plate(T, scale=1.4), *room(13.0)]):
         refusal = look_for_board(cast(shapes, sigma_m=0.008), BOARD, T, LIMITS)
         assert refusal.code in ("lidar.not_where_expected", "lidar.nothing_where_expected")
-    # A board elsewhere is not taken for the one predicted.
+    # A board elsewhere is not mistaken for the predicted one.
     refusal = look_for_board(view(place(2.6, 66, 20, 15)), BOARD, T, LIMITS)
     assert isinstance(refusal, Refusal)
 

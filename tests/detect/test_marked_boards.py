@@ -26,7 +26,7 @@ NEAR, FAR = looking(25, 40, 20, (0.1, 0, 1.6)), looking(35, 160, -50, (-0.3, 0.2
 
 
 def covered(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics, T: Array) -> NDArray[np.uint8]:
-    """Cover 30 % of the print with grey paper."""
+    """Cover 30 % of the pattern with grey paper."""
     w, h = np.array(board.pattern_size_m) * np.sqrt(0.3)
     low = np.array(board.pattern_size_m) / 2 - [w, h]
     paper = np.array([[0, 0, 0], [w, 0, 0], [w, h, 0], [0, h, 0]]) + [*low, 0]

@@ -1,4 +1,4 @@
-"""The board in point clouds without rings: where it is, what touches it, and what is not taken for it."""
+"""The board in point clouds without rings: its pose, touching surfaces, and false candidates."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def test_unstructured_board_without_background_is_found() -> None:
     scan = accumulate([board_plate(T), Box(pose(np.eye(3), np.array([3.0, 2.5, 0])), (1, 0.5, 2))])
     board = best(find_unstructured_boards(scan, BOARD, POINT_BEAM))
     assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.008
-    # Nothing tells where between the last return and the next ray the plate ends.
+    # The plate's end between the last return and the next ray is undetermined.
     beyond = outline_distance(board.edge_points, T)
     assert len(beyond) >= 12 and np.std(beyond) < 0.01 and abs(np.mean(beyond)) < 0.02
 
@@ -115,7 +115,7 @@ def test_too_few_points_are_refused(n: int) -> None:
 
 @pytest.mark.parametrize("n", [4_000, 8_000, 16_000])
 def test_sparse_board_without_a_located_border_is_refused(n: int) -> None:
-    """Without border nothing tells where in its plane the plate lies, and no residual would contradict."""
+    """Without a border, the plate's position in its plane is undetermined, and no residual reveals it."""
     scan = accumulate([board_plate(place(3, 5, 20)), *room(13)], n=n)
     found = find_unstructured_boards(scan, BOARD, POINT_BEAM)
     for board in () if isinstance(found, Refusal) else found:

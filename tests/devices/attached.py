@@ -1,4 +1,4 @@
-"""One attached sensor by itself: its samples as they come, then the reason of the end."""
+"""A single attached sensor: its samples as they arrive, then the reason for the end."""
 
 from contextlib import contextmanager
 from typing import TypeVar

@@ -1,4 +1,4 @@
-"""Which driver a sensor gets; samples in order, the reason of the end, and reading again when it is back."""
+"""Choice of a sensor's driver; order of samples, reason for the end, and reconnection."""
 
 import time
 
@@ -20,7 +20,7 @@ def pulse(count):
 
 
 class Script(LiveSource):
-    """A device that gives what it was told to, one entry a call; an error is raised; then nothing."""
+    """A device that returns given entries, one per call; errors are raised; then nothing."""
 
     def __init__(self, *entries, name="s", n_slots=9, silence_s=60.0):
         super().__init__(name, f"sensor {name!r}", silence_s, HINT, n_slots)
@@ -117,7 +117,7 @@ def test_attach_early_overflow_is_no_loss():
 
 def test_reading_close_ends_a_reopening():
     class Absent(Script):
-        """Gone for good: opening it waits until it is told to give up."""
+        """A permanently lost device: opening it waits until asked to stop."""
 
         n_opened = 0
 

@@ -34,7 +34,7 @@ def codes(status):
 
 
 def assert_tells_the_time(model, fake):
-    """Hold a clock against the board's own, by what the model claims: a busy computer answers late."""
+    """Compare a clock with the board's own, within the model's uncertainty: a busy computer replies late."""
     error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
     assert abs(error_ns) < 5e6 + 5 * model.sigma_ns(model.last_ns)
 
@@ -57,7 +57,7 @@ def test_sync_board_clock_is_synchronised_by_requests():
         error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
         assert abs(error_ns) < 5 * model.sigma_ns(model.last_ns) + 1000
         assert model.sigma_ns(model.last_ns) < 2_000_000
-        # On a busy machine any answer may come some milliseconds late.
+        # On a busy computer any reply may be some milliseconds late.
         assert model.drift == pytest.approx(-2000e-6, abs=200e-6 + 4e6 / (model.last_ns - model.first_ns))
         told = board.status().clock
         assert told is not None and told.figure("host_drift_ppm") == pytest.approx(-2000, rel=0.5)

@@ -1,4 +1,4 @@
-"""Lines of sync boards, sound and damaged, and what a board's messages add up to."""
+"""Intact and damaged lines of sync boards, and the state derived from their messages."""
 
 import re
 from functools import reduce
@@ -91,7 +91,7 @@ def test_board_state_clock_step_is_followed():
     assert (jumped.figures["n"], jumped.figure("last_s")) == (1, pytest.approx(3, abs=1e-3))
 
 
-def test_utc_comes_from_pulses_that_know_their_second():
+def test_utc_is_taken_from_pulses_with_utc_second():
     state = BoardState({})
     found = []
     for k in range(10):
@@ -104,7 +104,7 @@ def test_utc_comes_from_pulses_that_know_their_second():
     assert told.code == "clock.board" and told.figure("utc_drift_ppm") == pytest.approx(-40, abs=0.1)
 
 
-def test_falling_edges_and_strange_channels_make_no_pulses():
+def test_falling_edges_and_unknown_channels_give_no_pulses():
     state = BoardState({0: "cam"})
     assert state.take(TriggerEdge(0, 1, 5, False), arrival(0)) == []
     assert state.take(TriggerEdge(3, 1, 5, True), arrival(0)) == []

@@ -123,7 +123,7 @@ def test_firmware_sentences_cover_the_calendar(host_board):
     assert [rmc_utc_s(line) for line in done.stdout.split()] == seconds
 
 
-def test_firmware_says_hello_and_sends_pps(virtual):
+def test_firmware_sends_hello_and_pps(virtual):
     messages = virtual(5.5)
     assert messages[0] == Hello(1, "1.0", "virtual")
     edges = of_kind(messages, PpsEdge)

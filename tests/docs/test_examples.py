@@ -1,4 +1,4 @@
-"""The examples in docs/examples do on a simulated rig what they are there to show."""
+"""The examples in docs/examples work on a simulated rig."""
 
 import json
 import runpy

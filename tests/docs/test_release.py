@@ -1,4 +1,4 @@
-"""One version, and files for the package's users that say the same as the code."""
+"""One version, and files for the package's users that agree with the code."""
 
 from pathlib import Path
 

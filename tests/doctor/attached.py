@@ -69,7 +69,7 @@ class Attached:
 
 @contextmanager
 def attach(attached, folder):
-    """Attach everything; gives the profile that reaches it."""
+    """Attach everything; return the profile with the connections."""
     ports = free_ports()
     document = attached.rig.model_dump()
     document["lidars"]["lidar"]["driver"] = {

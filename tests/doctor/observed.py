@@ -1,4 +1,4 @@
-"""Sensors as they might have been observed, written down by hand: what the checks of them look at."""
+"""Made-up observations of sensors, as input of the checks."""
 
 import numpy as np
 
@@ -54,12 +54,12 @@ def look(check, *arguments):
 
 
 def codes(line):
-    """List the codes of what a line of the doctor's found."""
+    """List the codes of the findings in one line of `doctor`."""
     return [found.code for found in line.findings]
 
 
 def lidar(rate_hz=10.0, duration_s=5.0, **status):
-    """A LiDAR whose scans come on time."""
+    """A LiDAR whose scans arrive on time."""
     seen = ObservedSensor("lidar", SourceStatus("lidar", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
     nothing = np.zeros(0, np.float32)

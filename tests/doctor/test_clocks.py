@@ -15,7 +15,7 @@ from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, lo
 
 
 def with_utc(board):
-    """The board knows UTC, which the computer has exactly."""
+    """The board has UTC, equal to the computer's."""
     assert board.host_clock is not None
     return replace(board, utc_clock=board.host_clock)
 
@@ -77,7 +77,7 @@ def test_no_sync_in_profile_is_a_note():
     assert line is not None and line.severity == "note" and codes(line)[0] == "sync.boards_must_stand"
 
 
-def test_doctor_absent_sensors_do_not_count_for_sync():
+def test_doctor_ignores_absent_sensors_for_sync():
     absent = ObservedSensor("cam", failure=SourceError("it is not there"))
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 

@@ -1,4 +1,4 @@
-"""The computer, devices and their streams: what is absent, slow, lost or stopped has a line that says so."""
+"""The computer, devices and their streams: a line for each that is absent, slow, lost or stopped."""
 
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def test_scans_that_arrive_late_do_not_make_the_rotor_slow():
 
 
 @pytest.mark.parametrize(("n_lost", "severity"), [(0, "note"), (1, "warning"), (40, "error")])
-def test_losses_are_counted_and_judged_by_their_share(n_lost, severity):
+def test_losses_are_counted_and_judged_by_fraction(n_lost, severity):
     line = look(check_stream, examination(lidar(n_lost=n_lost, n_packets=3770)), "lidar")
     assert line is not None and line.severity == severity
     assert ("stream.losses" in codes(line)) == (n_lost > 0)

@@ -70,7 +70,7 @@ def test_observe_without_sensors_returns_at_once():
     assert time.monotonic() - start_s < 30 and seen["gone"].status is None
 
 
-def test_a_davis_over_the_network_has_its_events_counted(tmp_path):
+def test_davis_over_network_counts_events(tmp_path):
     pytest.importorskip("dv_processing")
     from lce_rig.devices.davis import DavisSource
     from tests.devices.test_davis import only_events, over_network, sender

@@ -1,4 +1,4 @@
-"""Frames equal pulses, or the line says so."""
+"""Missing or additional frames per pulse are reported."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def test_equal_images_and_pulses_are_a_note():
     assert line is not None and line.severity == "note"
     counts, delay = line.findings
     assert abs(counts.figure("n_frames") - counts.figure("n_pulses")) <= 1
-    # A board that is 40 ppm fast is tied to the computer's clock: the delay comes out all the same.
+    # A board that is 40 ppm fast is fitted to the computer's clock, so the delay is measured correctly.
     assert delay.figure("delay_ms") == pytest.approx(15.0, abs=0.01)
     assert delay.figure("delay_scatter_ms") < 0.01
 

@@ -1,4 +1,4 @@
-"""A VLP-16's lock on the pulse, from what its packets say."""
+"""A VLP-16's lock on the pulse, as reported by its packets."""
 
 import pytest
 

@@ -70,7 +70,7 @@ def calibration(T_cam_lidar=None, **changes):
 
 
 def reason(text):
-    """A reason of a verdict that only its words tell from others."""
+    """A reason of a verdict that differs from others only in its words."""
     return Finding("verdict.text", figures={"text": text}, stored=(text, ""))
 
 

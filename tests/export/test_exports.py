@@ -1,4 +1,4 @@
-"""Every export, read by programs that know nothing of how it was written."""
+"""Every export, read by independent programs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -224,7 +224,7 @@ def test_kalibr_chain_links_successive_cameras(three_sensor_rig, make, tmp_path)
     for index in (1, 2):
         T_cn_cnm1 = calibrations[index].T_cam_lidar @ np.linalg.inv(calibrations[index - 1].T_cam_lidar)
         np.testing.assert_allclose(chain[f"cam{index}"]["T_cn_cnm1"], T_cn_cnm1, atol=1e-12)
-    # Kalibr's radtan ends at p2: the camera with eight coefficients gets four others, and that is told.
+    # Kalibr's radtan ends at p2: the camera with eight coefficients gets four others, which is reported.
     (finding,) = findings
     assert (finding.code, finding.subject) == ("export.lens_fitted", "left")
     assert f"{finding.figure('max_px'):.3g} px" in files[0].read_text(encoding="utf-8")

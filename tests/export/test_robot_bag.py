@@ -1,4 +1,4 @@
-"""Static transforms of recordings, written by rosbags, and what is fitted into them."""
+"""Static transforms of recordings, written by rosbags, and the results fitted into them."""
 
 from collections.abc import Callable
 

@@ -54,7 +54,7 @@ def registry(tmp_path):
 
 @pytest.fixture(scope="session")
 def small_rig():
-    """Give the rig rlfs with images of half the size, which are found in half the time."""
+    """Return the rig rlfs with images of half the size, which are searched in half the time."""
     return half_size(load_rig("rlfs"))
 
 

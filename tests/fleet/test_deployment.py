@@ -59,7 +59,7 @@ def test_the_same_files_are_deployed_once(result, rig, local, robot):
     again = deploy(folder, rig, local)
     assert not again.is_new and again.release == first.release
     assert len(list((robot / "releases").iterdir())) == 1
-    # Also where somebody has changed a file there: then it is deployed anew.
+    # Also if a file there was changed: then it is deployed again.
     (robot / "current" / "extrinsics.yaml").write_text("mine")
     assert standing(local).changed == {"extrinsics.yaml": "changed"}
     assert plan(folder, rig, local).state.changed == {"extrinsics.yaml": "changed"}
@@ -323,7 +323,7 @@ def test_the_command_gets_the_robot_as_an_argument(result, rig, local):
 
 
 class Failing(Place):
-    """A place where the shell is killed before it starts its n-th program; flushing is left out."""
+    """A place where the shell is killed before it starts its n-th program; nothing is flushed."""
 
     def __init__(self, target, tools, n):
         super().__init__(target)

@@ -1,4 +1,4 @@
-"""Sessions and recordings below a root, and what a manifest says of them."""
+"""Sessions and recordings below a root, and their entries in a manifest."""
 
 import pytest
 
@@ -72,7 +72,7 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
     assert "rig profile" not in said and "rigs new" not in said and "top level" not in said
 
 
-def test_a_misspelt_key_of_a_manifest_is_told_the_nearest(tmp_path):
+def test_misspelt_manifest_key_suggests_nearest(tmp_path):
     lay_out(tmp_path, "a")
     (tmp_path / "fleet.yaml").write_text("sessions: [{path: a, robt: b}]")
     with pytest.raises(UsageError, match=r"sessions\.0\.robt.*robot"):

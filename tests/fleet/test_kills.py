@@ -18,7 +18,7 @@ from tests.shared import wait_until
 
 @pytest.mark.long
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_lost_worker_and_a_client_that_ends_lose_nothing(simulated, tmp_path, how):
+def test_results_survive_lost_worker_and_client(simulated, tmp_path, how):
     root, registry = tmp_path / "root", Registry(Storage.at(tmp_path / "registry"))
     for k in range(5):
         shutil.copytree(simulated, root / f"r{k}/s")

@@ -13,7 +13,7 @@ UPPER = np.triu_indices(6)
 
 @pytest.fixture
 def result(row):
-    """Give the row of session k of a robot, at a tangent in standard deviations."""
+    """Return the row of session k of a robot, at a tangent in standard deviations."""
 
     def make(robot, k, tangent=(0, 0, 0, 0, 0, 0), *, shared=0.0, **changes):
         T = perturb(np.eye(4), SIGMA * np.asarray(tangent, dtype=float))

@@ -34,7 +34,7 @@ def test_registry_lost_table_is_rewritten(registry, row):
     rows = [row("r1", folder=f"r1/{k}", source=str(k)) for k in range(3)]
     registry.consolidate(write(registry, rows[0]))
     for each in rows[1:]:
-        write(registry, each)  # whoever wrote these was killed before the table
+        write(registry, each)  # as if the process had been killed before writing the table
     whole = registry.consolidate()
     assert folders(whole) == ["r1/0", "r1/1", "r1/2"]
     (registry.place.local / TABLE).write_bytes(b"torn")
@@ -95,7 +95,7 @@ def test_registry_failed_write_keeps_folder(registry, row):
     ],
 )
 def test_registry_damaged_file_affects_only_its_session(registry, row, content):
-    """Where a row says ok, result.json is damaged."""
+    """A row has status ok, but its result.json is damaged."""
     folder = "r1/20260105T100000Z-0123456789ab"
     write(registry, row(folder=folder), "result.json")
     write(registry, row("r2", folder="r2/b"))

@@ -93,7 +93,7 @@ def test_fleet_s3_files_equal_those_on_disk(fleet_root, tmp_path, bucket):
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_result_in_a_store_counts_when_its_rows_are_there(row, bucket):
+def test_stored_result_counts_once_its_rows_exist(row, bucket):
     registry = Registry(bucket / "registry")
 
     def write(name, **changes):

@@ -1,4 +1,4 @@
-"""Targets: found by name, and refused where a path or an option could be taken for something else."""
+"""Targets: found by name; ambiguous paths and options are refused."""
 
 import shlex
 

@@ -1,4 +1,4 @@
-"""Raw events in bags beside pictures and scans: topics, order, clocks, and what may be wrong with them."""
+"""Raw events in bags beside images and scans: topics, order, clocks, and faults."""
 
 from dataclasses import replace
 

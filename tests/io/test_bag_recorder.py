@@ -47,7 +47,7 @@ def test_bag_recorder_colour_and_timeless(tmp_path, rles):
 
 
 @pytest.mark.parametrize("has_times", [True, False])
-def test_stamps_mark_the_firing_that_the_profile_says(tmp_path, rles, has_times):
+def test_timestamps_mark_the_firing_of_the_profile(tmp_path, rles, has_times):
     rig = changed(rles, lidars__lidar__timestamps__reference="last_firing")
     given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
     _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)

@@ -1,4 +1,4 @@
-"""Files of an event camera's own recorder as recordings: events, frames, and what may be wrong with them."""
+"""Files of an event camera's own recorder as recordings: events, frames, and faults."""
 
 from dataclasses import replace
 

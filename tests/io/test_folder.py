@@ -36,7 +36,7 @@ def make_folder(tmp_path, room):
 @pytest.mark.parametrize(
     "names", [("img", "pcd"), ("images", "raw_pcd"), ("IMG", "clouds"), (".", "."), ("a", "b")]
 )
-def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, names):
+def test_folders_are_found_by_name_or_content(make_folder, rig, room, names):
     recording = open_recording(make_folder(names=names), rig)
     (note,) = recording.notes
     assert has_note([note], "2 pairs", "equal file") and "partner" not in note
@@ -186,7 +186,7 @@ def test_folder_ambiguous_names_are_not_paired(images, clouds, may_count):
         pair_names(images, clouds, may_count=may_count)
 
 
-def test_only_names_that_are_times_are_taken_for_times():
+def test_parse_times_rejects_other_names():
     assert parse_times(["2311.422000"]).tolist() == [2311_422_000_000]
     assert parse_times(["1700000000123456789"]).tolist() == [1_700_000_000_123_456_789]
     assert parse_times(["1700000000123456"]).tolist() == [1_700_000_000_123_456_000]

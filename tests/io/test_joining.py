@@ -1,4 +1,4 @@
-"""Recordings of one moment by several recorders: which belong together, and in what order they are read."""
+"""Simultaneous recordings by several recorders: grouping and order."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -39,7 +39,7 @@ def sample(stream, time_s):
 
 @dataclass
 class Listed:
-    """A recording of samples given in advance, and torn behind them where `torn` says so."""
+    """A recording of given samples, torn after them if `torn`."""
 
     name: str
     contents: list[tuple[Stream, float]]

@@ -69,7 +69,7 @@ def of_model(model, **changes):
 def test_livox_both_drivers_are_accumulated(tmp_path, package, is_ros1):
     path = write_custom(tmp_path / "bag", package, 25, is_ros1)
     scans = scans_of(path, of_model("Avia"))
-    # At one scan per second: two whole ones, and what is left.
+    # At one scan per second: two complete ones, and the rest.
     assert [scan.stamp_ns for scan in scans] == [T0_NS + k * 10**9 for k in range(3)]
     assert [len(scan.points) for scan in scans] == [10 * 160, 10 * 160, 5 * 160]
     first = scans[0]

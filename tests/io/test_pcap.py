@@ -1,4 +1,4 @@
-"""Recordings of the network of many kinds give the same scans, or an error that says why not."""
+"""Network recordings of many kinds give the same scans, or an error with the reason."""
 
 import struct
 from collections.abc import Callable

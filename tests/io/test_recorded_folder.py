@@ -1,4 +1,4 @@
-"""A folder that several recorders filled is read as one recording; other folders stay what they were."""
+"""A folder filled by several recorders is read as one recording; other folders are not."""
 
 import cv2
 import numpy as np

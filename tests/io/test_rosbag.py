@@ -1,4 +1,4 @@
-"""Bags of all three kinds, with whatever layouts, topics, stamps and damage they come."""
+"""Bags of all three kinds, with various layouts, topics, timestamps and damage."""
 
 import os
 import shutil
@@ -209,7 +209,7 @@ def test_bag_clock_set_back_restarts_order(tmp_path, rig, write_bag, stream):
     assert has_note(recording.notes, CAM, "1 jumps", "clock back")
 
 
-def test_messages_without_stamps_take_the_time_of_receipt(
+def test_messages_without_timestamps_use_time_of_receipt(
     tmp_path, rig, room, picture, write_bag, cloud_message, image_message
 ):
     messages = [
@@ -296,7 +296,7 @@ def test_bag_damaged_gives_source_error(small_bags, rig, kind, data):
 
 @pytest.fixture(scope="module")
 def small_bags(tmp_path_factory, write_bag, room, cloud_message, image_message):
-    """Content of a bag of each kind, and a path to write it damaged to."""
+    """Content of a bag of each kind, and a path for a damaged copy."""
     pixels = np.zeros((4, 6), np.uint8)
     bags = {}
     for kind in KINDS:

@@ -1,4 +1,4 @@
-"""A bag tells what a profile has to say of its sensors."""
+"""Sensors of a profile from a bag."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def test_survey_video_topics_are_listed(tmp_path):
         writer.write(connection, 10**18, store.serialize_cdr(message, name))
     with pytest.raises(SourceError) as caught:
         survey_bag(tmp_path / "bag")
-    assert "/front/video: skipped, foxglove_msgs/CompressedVideo is not read" in caught.value.hint
+    assert "/front/video: skipped, foxglove_msgs/CompressedVideo is not supported" in caught.value.hint
 
 
 LENS = parse_intrinsics("radtan,64x48,50,50,32,24")

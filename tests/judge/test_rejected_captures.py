@@ -83,7 +83,7 @@ def test_early_moved_sensor_does_not_pass() -> None:
 
 
 @pytest.mark.long
-def test_captures_in_any_order_that_agree_are_one_mounting() -> None:
+def test_agreeing_captures_are_one_mounting_in_any_order() -> None:
     boards = simulate(18, 4)
     away = (3, 8, 12)
     boards = [moved([board], range(1 if k in away else 0), turned(4.0))[0] for k, board in enumerate(boards)]

@@ -95,7 +95,7 @@ def test_repeat_same_captures_mostly_agree(correlation):
     assert n_refused <= 3 + 3 * np.sqrt(3)
 
 
-def test_differences_are_stated_where_boards_were() -> None:
+def test_differences_are_stated_at_board_distances() -> None:
     """A rotation that a translation undoes at 2 m displaces nothing there."""
     lowered = perturb(np.eye(4), np.array([0.0, 2 * np.radians(0.2), 0.0, np.radians(0.2), 0.0, 0.0]))
     results = {

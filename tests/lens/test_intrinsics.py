@@ -69,7 +69,7 @@ def test_convert_larger_lens_model_is_equal():
         RADTAN5.vector(FISHEYE)
 
 
-def test_lens_and_board_are_found_within_their_deviations(estimate):
+def test_lens_and_board_are_estimated_within_their_deviations(estimate):
     assert np.abs(deviations(estimate, WIDE)).max() < 4
     shape, sigma = estimate.pattern_shape
     assert np.all(np.abs(shape - [0.0012, -0.0006, 0.001]) < 4 * sigma)

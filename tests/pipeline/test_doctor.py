@@ -47,7 +47,7 @@ def test_every_device_of_an_attached_rig_answers_by_name(everything):
     assert "LCE1" in str(lines["sync", "device"].figures["device"])
 
 
-def test_its_streams_come_and_none_of_them_is_lost(everything):
+def test_streams_arrive_without_losses(everything):
     lines, *_ = everything
     # A busy computer sends late and in bursts; the judgement of rates is tested separately.
     lidar, cam = lines["lidar", "stream"].findings, lines["cam", "stream"].findings

@@ -107,7 +107,7 @@ def test_event_time_is_median_of_first_board(seen):
     assert stamp({}) is None
 
 
-def test_other_scan_makes_another_image(tmp_path, stream):
+def test_other_scan_gives_another_image(tmp_path, stream):
     first = found_in(session_of(tmp_path / "a", stream))
     other = session_of(tmp_path / "b", stream, stamp_ns=SCAN_NS - 40 * MS)
     # The cache travels along: the samples are the same, only the stamp is not.
@@ -121,7 +121,7 @@ def test_a_stored_picture_is_taken(tmp_path, stream):
     assert found_in(session).code == "image.low_contrast"
 
 
-def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):
+def test_damaged_events_are_refused_as_damaged(tmp_path, stream):
     session = session_of(tmp_path, stream)
     path = session.captures[0].path / "dvs.events.npz"
     path.write_bytes(path.read_bytes()[:-100])

@@ -162,5 +162,5 @@ def test_wrong_sensor_is_named_first_in_many_sessions():
         print(f"{kind}: named in all its pairs and in no other in {sum(found)} of {len(found)} sessions")
     print(f"pairs that pass beyond 95 % five times over: {wrong_passes}")
     assert np.mean([each for found in right.values() for each in found]) > 0.95
-    # In one session a single placement comes after the motion: its capture is an outlier of two pairs.
+    # In one session a single placement follows the motion: its capture is an outlier of two pairs.
     assert wrong_passes <= 2

@@ -29,12 +29,12 @@ def test_numbers_alone_make_a_profile():
 @pytest.mark.parametrize(
     "board", ["charuco:9x7,0.07,0.0525,5X5_50,0.767x0.626", "aprilgrid:4x3,0.13,0.3,0.767x0.626,0.01,0"]
 )
-def test_a_board_with_markers_is_written_as_it_was_given(board):
+def test_board_with_markers_is_written_as_given(board):
     text, _ = new_profile("a", parse_board(board), intrinsics=[parse_intrinsics(LENS)])
     assert parse_rig(text).board.to_board() == parse_board(board)
 
 
-def test_a_camera_info_file_of_any_maker_is_taken(tmp_path):
+def test_camera_info_file_of_any_tool_is_accepted(tmp_path):
     lens = Intrinsics(897.5, 896.8, 635.4, 375.3, 1280, 720, "radtan", (-0.44, 0.233, -0.001, 0.0002, -0.073))
     path = tmp_path / "camera_info.yaml"
     # A calibrated camera's projection matrix is of the rectified image.
@@ -48,7 +48,7 @@ def test_a_camera_info_file_of_any_maker_is_taken(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "8x6", "8x6,0.07", "8x6,0.07,0.7", "8x6,a,0.7x0.6", "8,6,0.07,0.7x0.6"])
-def test_a_board_written_otherwise_is_a_usage_error(text):
+def test_malformed_board_is_usage_error(text):
     with pytest.raises(UsageError):
         parse_board(text)
 
@@ -60,7 +60,7 @@ def test_intrinsics_written_otherwise_are_a_usage_error(text):
 
 
 @pytest.mark.parametrize("content", ["", "[1, 2]", "a: 1", "camera_matrix: {data: [1]}", "\x00", "a: [b"])
-def test_a_file_that_is_no_camera_info_is_named(tmp_path, content):
+def test_file_without_camera_info_is_named(tmp_path, content):
     path = tmp_path / "info.yaml"
     path.write_text(content)
     with pytest.raises(ProfileError, match=r"info\.yaml"):

@@ -123,7 +123,7 @@ def test_write_keeps_user_files(session, folder):
 
 
 @pytest.mark.parametrize("name", ["calibration", "calibration/previous"])
-def test_a_file_in_place_of_a_folder_is_refused_and_stays(session, folder, name):
+def test_file_in_place_of_folder_is_refused_and_kept(session, folder, name):
     if name != "calibration":
         write(session, GOOD)
     (session.path / name).write_text("mine")
@@ -155,7 +155,7 @@ def test_write_folder_as_result_is_kept(session, folder):
     assert (folder / "previous" / "result.json" / "note").read_text() == "mine"
 
 
-def test_the_extrinsic_of_a_camera_is_given_by_its_name(session):
+def test_extrinsics_are_selected_by_camera_name(session):
     result = Result(session, (GOOD,))
     assert result.of(GOOD.camera) is result.of(GOOD.camera, GOOD.lidar) is GOOD
     with pytest.raises(NotEnoughDataError):

@@ -36,7 +36,7 @@ def test_a_missing_key_is_added_at_the_end_of_its_block():
     assert rig.calibration.target_sigma_deg == load_rig("rles").calibration.target_sigma_deg
 
 
-def test_entries_of_lists_are_reached_by_their_place():
+def test_set_value_reaches_list_entries_by_index():
     rig = parse_rig(set_value(RLES, "nominal_extrinsics.0.translation_m", "[1, 2, 3]"))
     assert rig.nominal_extrinsics[0].translation_m == (1, 2, 3)
 

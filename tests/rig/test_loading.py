@@ -64,7 +64,7 @@ def test_misspelt_profile_lists_known_names():
 
 
 @pytest.mark.parametrize("name", ["nothing.yaml", "no/such/rlfs", "/tmp"])
-def test_a_missing_file_or_a_folder_is_no_profile(name):
+def test_missing_file_or_folder_is_not_a_profile(name):
     with pytest.raises(ProfileError):
         load_rig(name)
 

@@ -79,7 +79,7 @@ def test_nominal_pose_forward_is_camera_axis():
         ("format_version: 1", "format_version: 2", "format_version"),
     ],
 )
-def test_each_mistake_is_named_with_its_line_and_key(old, new, key):
+def test_each_profile_error_names_line_and_key(old, new, key):
     position, _, message = refusal((old, new)).partition(": ")
     assert message.startswith(f"{key}: ")
     source, _, line = position.partition(":")
@@ -111,7 +111,7 @@ def test_mistake_names_figure_or_key(edits, facts):
     assert all(fact in text for fact in facts)
 
 
-def test_board_that_fits_both_ways_round_gives_a_warning():
+def test_board_with_possibly_swapped_sides_gives_a_warning():
     turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
     assert [warning.code for warning in parse_rig(turned).warnings()] == ["profile.swapped_sides"]
     assert not list(load_rig("sss").warnings())
@@ -289,6 +289,6 @@ def test_marked_board_profile_reads_back():
 
 
 @pytest.mark.parametrize("exports", ["urdf", "[[urdf]]", "[{urdf: 1}]", "[urdf, nonsense]"])
-def test_exports_that_are_no_list_of_formats_are_refused(exports):
+def test_exports_must_be_a_list_of_formats(exports):
     with pytest.raises(ProfileError, match="exports"):
         parse_rig(set_value(RLFS, "exports", exports))

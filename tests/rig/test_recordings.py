@@ -1,4 +1,4 @@
-"""The shipped profiles against the numbers that came with the recordings."""
+"""The shipped profiles compared with the figures supplied with the recordings."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The scene's opinion on extrinsics, against a simulated room's truth."""
+"""Drift by the scene's edges, compared with the truth of a simulated room."""
 
 from dataclasses import replace
 

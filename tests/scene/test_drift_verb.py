@@ -182,7 +182,7 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys):
 
 @pytest.mark.realtime
 @pytest.mark.long
-def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path):
+def test_ctrl_c_ends_the_watch_with_a_judgement(seen, tmp_path):
     capture = seen.captures[0]
     here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
     with attach(here, tmp_path) as rig:

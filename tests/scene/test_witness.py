@@ -1,4 +1,4 @@
-"""The scene's opinion on results of a simulated room, without the board's edges."""
+"""The check of results by the edges of a simulated room, without the board's."""
 
 import json
 import shutil

@@ -3,7 +3,7 @@ from draw_architecture import PICTURE, draw, layers
 
 
 @pytest.mark.long
-def test_the_picture_shows_the_imports_as_they_are():
+def test_architecture_diagram_is_up_to_date():
     """Run scripts/draw_architecture.py after a change of rooms or imports."""
     assert PICTURE.read_text(encoding="utf-8") == draw()
 

@@ -166,7 +166,7 @@ def test_focus_drift_grows_to_the_last_image(profile, found):
     np.testing.assert_allclose(ratios[-1], 1 / 1.01, atol=1e-3)
 
 
-def test_second_board_looks_farther_in_the_second_half(profile, found):
+def test_second_board_is_searched_farther_in_the_second_half(profile, found):
     before, after = boards_of(found), boards_of(with_second_board(profile, found, 0.9))
     ratios = [new.distance_m / old.distance_m for (old, _), (new, _) in zip(before, after, strict=True)]
     np.testing.assert_allclose(ratios[:4], 1, atol=1e-4)

@@ -110,7 +110,7 @@ def test_captures_of_other_events_are_new(tmp_path, rles):
         {"x": np.full(500, 346, np.uint16)},
     ],
 )
-def test_events_that_cannot_be_the_rigs_are_refused(tmp_path, rles, changes):
+def test_events_of_another_rig_are_refused(tmp_path, rles, changes):
     session = Session.create(tmp_path / "s", rles)
     with pytest.raises(SessionError):
         session.add_capture(*noise_samples(0), {}, [replace(noise_events(0), **changes)])

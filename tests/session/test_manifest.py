@@ -37,7 +37,7 @@ def change(capture, index=0, **changes):
         {"channel": "../x"},
     ],
 )
-def test_values_of_the_wrong_kind_are_named_with_their_key(capture, changes):
+def test_wrong_value_types_are_named_with_their_key(capture, changes):
     change(capture, **changes)
     with pytest.raises(SessionError, match=rf"meta\.json: .*{next(iter(changes))}"):
         capture.check()
@@ -46,7 +46,7 @@ def test_values_of_the_wrong_kind_are_named_with_their_key(capture, changes):
 @pytest.mark.parametrize(
     ("index", "field"), [(0, "camera"), (0, "channel"), (0, "stamp_ns"), (1, "lidar"), (1, "stamp_ns")]
 )
-def test_a_field_that_an_entry_lacks_is_named(capture, index, field):
+def test_missing_field_of_entry_is_named(capture, index, field):
     path = capture.path / "meta.json"
     manifest = json.loads(path.read_text())
     del manifest["files"][index][field]

@@ -16,7 +16,7 @@ def with_square(rig, square_m):
     return changed(rig, board__square_m=square_m)
 
 
-def test_the_new_profile_counts_and_every_earlier_one_stays(rig, tmp_path):
+def test_new_profile_is_used_and_earlier_ones_are_kept(rig, tmp_path):
     path = tmp_path / "s"
     named = rig.of_robot("kestrel")
     Session.create(path, named).close()

@@ -1,4 +1,4 @@
-"""Where results come from: robot, serial numbers, date, and a fingerprint that only inputs change."""
+"""Provenance of results: robot, serial numbers, date, and a fingerprint that depends on inputs only."""
 
 import shutil
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def test_provenance_joins_captures_and_rig(fill, rig, tmp_path):
     assert (found.date, found.imported) == ("2001-09-09T01:46:40Z", None)
 
 
-def test_two_units_of_one_sensor_are_no_result(fill, rig, tmp_path):
+def test_two_units_of_one_sensor_are_refused(fill, rig, tmp_path):
     with pytest.raises(SessionError):
         provenance_of(fill(tmp_path / "a", rig, {"lidar": "A"}, {"lidar": "B"}))
     one, other = (fill(tmp_path / s, rig, {"lidar": s}, seeds=(k,)) for k, s in enumerate("XY"))
@@ -90,7 +90,7 @@ def test_provenance_without_times_has_import(rig, samples, tmp_path):
     assert (origin.date, origin.imported, origin.date_words) == (None, None, "")
 
 
-def test_a_robot_is_named_later_and_not_renamed(rig, tmp_path, samples):
+def test_robot_can_be_named_later_but_not_renamed(rig, tmp_path, samples):
     with Session.create(tmp_path / "a", rig) as session:
         session.add_capture(*samples(0), {})
     Session.resume(tmp_path / "a", rig.of_robot("kestrel")).close()

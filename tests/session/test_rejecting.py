@@ -1,4 +1,4 @@
-"""Rejected captures are out of use, not lost, and come back as they were."""
+"""Rejected captures are not used, but kept, and restored unchanged."""
 
 import pytest
 
@@ -63,7 +63,7 @@ def test_add_session_copies_captures_once(session, tmp_path, rig, samples):
 
 
 @pytest.mark.parametrize("verb", ["reject", "restore"])
-def test_a_capture_that_is_not_there_is_named(session, verb):
+def test_missing_capture_is_named(session, verb):
     with pytest.raises(SessionError, match="000009"):
         getattr(session, verb)("000009")
 
@@ -74,7 +74,7 @@ def test_reject_in_read_only_session_is_refused(session):
     assert len(session.captures) == 3
 
 
-def test_nothing_is_replaced_where_a_capture_is_to_go(session):
+def test_capture_never_replaces_existing_folder(session):
     session.reject("000000")
     (session.path / "captures" / "000000").mkdir()
     (session.path / "captures" / "000000" / "mine.txt").write_text("a user's")
@@ -84,7 +84,7 @@ def test_nothing_is_replaced_where_a_capture_is_to_go(session):
     assert names(session.rejected) == ["000000"]
 
 
-def test_nothing_moves_where_the_journal_cannot_be_written(session):
+def test_capture_does_not_move_without_journal_entry(session):
     (session.path / "journal.jsonl").unlink()
     (session.path / "journal.jsonl").mkdir()
     with pytest.raises(SessionError):

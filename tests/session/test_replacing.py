@@ -79,14 +79,14 @@ def test_killed_replacement_leaves_one_complete_folder(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_folder_put_aside_by_a_killed_process_comes_back(tmp_path):
+def test_folder_moved_by_killed_process_is_restored(tmp_path):
     fill(tmp_path, "one")
     (tmp_path / "out").rename(tmp_path / ".old-out")
     recover(tmp_path)
     assert contents(tmp_path / "out") == {"one"}
 
 
-def test_a_draft_that_is_being_filled_is_left_alone(tmp_path):
+def test_draft_in_use_is_kept(tmp_path):
     with replacing(tmp_path, tmp_path / "out") as slow:
         (slow / "a").write_text("slow")
         fill(tmp_path, "quick")
@@ -103,7 +103,7 @@ def test_copies_share_their_data_and_links_stay_links(tmp_path):
     assert (tmp_path / "two" / "link").is_symlink()
 
 
-def test_a_link_that_stays_in_the_session_serves(tmp_path, rig, samples):
+def test_link_within_session_is_followed(tmp_path, rig, samples):
     Session.create(tmp_path / "s", rig).close()
     (tmp_path / "s" / "captures").rmdir()
     (tmp_path / "s" / "more").mkdir()

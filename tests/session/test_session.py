@@ -13,7 +13,7 @@ from lce_rig.session.durable import load_arrays, store_arrays
 from tests.shared import changed
 
 
-def test_a_capture_comes_back_exactly_as_it_was_given(tmp_path, rig, samples):
+def test_capture_is_read_exactly_as_written(tmp_path, rig, samples):
     images, scans = samples(1)
     with Session.create(tmp_path / "s", rig) as session:
         name = session.add_capture(images, scans, {"source": {"key": "k"}})

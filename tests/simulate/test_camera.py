@@ -31,7 +31,7 @@ def refined(picture, truth):
 
 
 @pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
-def test_corners_lie_where_the_truth_projects_them(room, board, backdrop, T_world_board):
+def test_corners_agree_with_projected_truth(room, board, backdrop, T_world_board):
     scene = Scene(
         room.raycaster,
         build_carrier("stand", board, T_world_board, np.random.default_rng(0)),

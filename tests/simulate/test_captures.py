@@ -49,7 +49,7 @@ def test_truth_is_within_nominal_tolerance(rig):
     assert not np.allclose(truths[0], truths[1])
 
 
-def test_the_papers_simulated_rig_has_exactly_its_extrinsic():
+def test_simulated_rig_of_paper_has_exact_extrinsics():
     rig = make_rig("sss")
     assert np.allclose(
         truth_extrinsics(rig, 3)["cam", "lidar"], rig.nominal_extrinsics[0].to_matrix(), atol=1e-12

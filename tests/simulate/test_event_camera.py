@@ -129,7 +129,7 @@ def test_slow_pixels_lag_behind_and_dark_ones_more():
     assert np.allclose(delay_s, expected, atol=1e-3)
 
 
-def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark():
+def test_noise_has_its_rate_and_increases_in_the_dark():
     noise = replace(QUIET_EVENTS, noise_hz=10.0)
     halves = np.where(np.arange(SHAPE[1]) < 32, 0.0, 1.0).astype(np.float32) * np.ones(SHAPE, np.float32)
     (events,) = record(noise, lambda t_s: halves, duration_s=2.0, step_s=0.05)

@@ -25,7 +25,7 @@ def samples(live, stamp_ns):
     return image, scan
 
 
-def test_a_board_on_its_way_is_seen_where_it_is(live):
+def test_moving_board_is_seen_at_its_pose(live):
     start, end = board_before_lidar(2.2, yaw_deg=20.0), board_before_lidar(2.6, yaw_deg=-10.0)
     live.pass_by(start, end, 0.5)
     on_its_way, _ = samples(live, 0)

@@ -27,7 +27,7 @@ def test_a_swaying_board_passes_its_placement_exactly(seed):
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 0.05, 0.3])
-def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps):
+def test_speed_over_last_second_is_as_requested(speed_mps):
     for seed in range(4):
         trajectory = sway(HandMotion(speed_mps=(speed_mps, speed_mps), tremor_m=0.0), seed)
         rms_mps = np.sqrt(np.mean(trajectory.speed_mps(BEFORE_NS) ** 2))

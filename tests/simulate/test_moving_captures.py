@@ -103,7 +103,7 @@ def test_event_rates_are_those_of_a_davis346(captures):
         assert np.sum(per_pixel > 9.0) >= 5 and per_pixel.max() > 50
 
 
-def test_quiet_events_reproduce_what_the_camera_saw(rig, quiet):
+def test_events_without_noise_reproduce_the_scene(rig, quiet):
     stage = set_stage(rig, 6, BRIEF)
     view = StagedBoard(stage, quiet.trajectory, stage.rng(0)).view("cam")
     noise, events = BRIEF.events, quiet.events[0]

@@ -21,7 +21,7 @@ def view_and_scene(room, board, backdrop, T_world_board):
 
 
 @pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
-def test_corners_lie_where_truth_and_pictures_have_them(room, board, backdrop, T_world_board):
+def test_corners_agree_with_truth_and_images(room, board, backdrop, T_world_board):
     view, scene = view_and_scene(room, board, backdrop, T_world_board)
     seen = view.at(T_NS)
     subframe = np.rint(255 * np.clip(seen, 0, 1) ** (1 / 2.2)).astype(np.uint8)
@@ -33,7 +33,7 @@ def test_corners_lie_where_truth_and_pictures_have_them(room, board, backdrop, T
     assert np.abs(in_subframe - in_picture).max() < 0.1
 
 
-def test_the_board_is_as_bright_as_in_pictures(room, board, backdrop):
+def test_board_is_as_bright_as_in_images(room, board, backdrop):
     import cv2
 
     view, scene = view_and_scene(room, board, backdrop, PLACEMENTS[0])

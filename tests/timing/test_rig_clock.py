@@ -1,4 +1,4 @@
-"""Stamps of several sensors on one clock, as pulses and models of a sync board come in."""
+"""Timestamps of several sensors on one clock, with pulses and models of a sync board."""
 
 from dataclasses import dataclass, replace
 

@@ -31,7 +31,7 @@ def pairs(samples, rig):
 
 
 def alone(losses):
-    """Give how many scans found no image, and how near the nearest was, s."""
+    """Return the number of scans without an image, and the smallest time difference, s."""
     ((finding, n),) = losses.counts()
     assert finding.code == "read.no_image_at_scan"
     return n, round(finding.figures["nearest_s"], 9)

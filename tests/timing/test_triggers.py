@@ -25,7 +25,7 @@ def matcher_of(max_delay_ms=30.0):
 
 @dataclass
 class Rig:
-    """A board and a camera it triggers, and what becomes of both streams on their way.
+    """A board and a camera it triggers, with faults in both streams.
 
     Attributes:
         seed: of everything random.

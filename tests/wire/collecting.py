@@ -49,11 +49,11 @@ class Collecting:
         return len(Session.open(self.session).captures) if marker.exists() else 0
 
     def wait_for(self, text, within_s=180.0, times=1):
-        """Wait until it has said something so often."""
+        """Wait until the output contains a text a given number of times."""
         self._wait(lambda: self.said.count(text) >= times, f"{text!r} was not said", within_s)
 
     def wait_for_captures(self, n, within_s=180.0):
-        """Wait until the session holds so many."""
+        """Wait until the session has a given number of captures."""
         self._wait(lambda: self.n_captures >= n, f"there are not {n} captures", within_s)
 
     def wait(self, within_s=180.0):

@@ -37,7 +37,7 @@ class RandomDavis:
         self.n_events = self.n_frames = 0
 
     def getNextEventBatch(self):
-        """Give the events of the next 10 ms, once they are over."""
+        """Return the events of the next 10 ms, after their end."""
         start_us = self._batch * _BATCH_US
         if time.time_ns() // 1000 < start_us + _BATCH_US:
             return None
@@ -63,7 +63,7 @@ class RandomDavis:
         return self._dv.Frame(start_us, _EXPOSURE_US, 0, 0, image, self._dv.FrameSource.SENSOR)
 
     def getNextTriggerBatch(self):
-        """Give the edge of the last whole second, once."""
+        """Return the edge of the last whole second, only once."""
         stamp_us = self._pulse * _SECOND_US
         if time.time_ns() // 1000 < stamp_us:
             return None

@@ -76,7 +76,7 @@ def make_reel(folder, rig, n_placements, seed=0):
 
 
 def _turn_evenly(packets):
-    """Give all loops the same azimuths, so that the rotor turns evenly from one placement to the next.
+    """Align the azimuths of all loops, so that the rotor turns evenly from one placement to the next.
 
     Each simulated placement begins anywhere within a step, by which it is turned here; 0.2 deg at most.
     """

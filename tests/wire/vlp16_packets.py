@@ -142,7 +142,7 @@ def free_ports():
 
 
 def gprmc(time_ns, is_valid=True):
-    """Word the sentence for the pulse that came last before a time, without its line end."""
+    """Write the sentence for the last pulse before a time, without its line end."""
     when = datetime.fromtimestamp(time_ns // _NS_PER_S, timezone.utc)
     status = "A" if is_valid else "V"
     body = f"GPRMC,{when:%H%M%S},{status},2219.9000,N,11415.9000,E,000.0,000.0,{when:%d%m%y},,,A"

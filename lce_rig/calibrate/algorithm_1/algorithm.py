@@ -59,7 +59,7 @@ class Algorithm1(Start):
 
     Attributes:
         problem: the moments of the captures used.
-        cost: about the solution, in tangent (translation m, rotation rad) and edge shift m.
+        cost: quadratic cost at the solution, in tangent (translation m, rotation rad) and edge shift m.
     """
 
     problem: Problem

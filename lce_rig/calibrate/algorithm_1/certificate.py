@@ -9,12 +9,12 @@ gives f(R) = g + z^T Z z >= g + 4 min(eig Z, 0) on SO(3), since |z|^2 = 4. With 
 
     f(R*) - min f <= f(R*) - g + 4 (max(-lambda, 0) + |Z E|)                                         (2)
 
-where lambda is the least eigenvalue of Z on the complement of E. After turning the problem so that R* = I,
+where lambda is the least eigenvalue of Z on the complement of E. After rotating the problem so that R* = I,
 E, the pseudo-inverse that solves Z E = 0 for the multipliers, and the family N_j of multipliers that leave
 Z E alone are constants. Multipliers of least norm are tried first, then those that maximise lambda within the
 family, by a barrier method.
 
-(2) holds whether or not any of this has converged. It says nothing about how well the minimum is determined.
+(2) holds whether or not any of this has converged. It does not measure how well the minimum is determined.
 
 References:
     Briales, Gonzalez-Jimenez, "Convex global 3D registration with Lagrangian duality", CVPR 2017.
@@ -65,7 +65,7 @@ def certify(Q: Array, R: Array) -> Certificates:
 
     Args:
         Q: (B, 10, 10).
-        R: (B, 3, 3) candidates, as `minimise_on_so3` gives them.
+        R: (B, 3, 3) candidates from `minimise_on_so3`.
     """
     cost = rotation_cost(Q, R)
     tolerance = _RELATIVE_GAP * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
@@ -195,7 +195,7 @@ def _raise_least_eigenvalue(Z: Array) -> Array:
     """Maximise s subject to Z + sum c_j N_j >= s I by Newton's method on s + mu log det(. - s I), mu -> 0.
 
     Returns:
-        (B,) the largest least eigenvalue of Z + sum c_j N_j that was met.
+        (B,) the largest least eigenvalue of Z + sum c_j N_j that was found.
     """
     family = _dual().family
     m = len(family)

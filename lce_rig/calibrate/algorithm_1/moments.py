@@ -6,7 +6,7 @@ Per capture k the cost is
 
 over the board's plane (n_k, g_k) and edges (m_e, h_e) as the camera sees them, points p_i and ring ends q_j
 of the LiDAR, the edge e(j) nearest to each ring end, and the edge shift d by which ring ends appear beyond
-the print. Means and not sums, so that a board nearby does not outvote one farther away by its many points:
+the plate. Means instead of sums, so that a near board does not outweigh a far one by its many points:
 all points of a capture share the errors of the board's pose in the image. Every ring end keeps one row for
 each of the four edges, so that association only chooses which are summed.
 """
@@ -108,7 +108,7 @@ class Problem:
             x: (B, 14).
 
         Returns:
-            (B, n), as `Board.nearest_edge`.
+            (B, n) edges, numbered as in `Board.nearest_edge`.
         """
         return self._board.nearest_edge(self._on_board(x))
 

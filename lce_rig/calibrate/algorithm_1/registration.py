@@ -166,7 +166,8 @@ def _newton_step(hessian: Array, gradient: Array, damping: Array) -> tuple[Array
     values, vectors = np.linalg.eigh(hessian)
     is_convex = values[:, 0] + damping > 0
     size = np.abs(values)
-    # |eigenvalues| turn the step away from a saddle; the floor keeps it finite along flat directions.
+    # Absolute eigenvalues direct the step away from a saddle; the floor keeps it finite along flat
+    # directions.
     floored = np.maximum(size, 1e-3 * size.max(axis=1, keepdims=True)) + 1e-300
     size = np.where(is_convex[:, None], values, floored) + damping[:, None]
     along = np.swapaxes(vectors, 1, 2) @ gradient[..., None]

@@ -104,10 +104,10 @@ class JointEstimate(Optimum):
     """The optimum, with G unknowns z shared by all captures.
 
     Attributes:
-        terms: linearised there.
+        terms: terms linearised at the optimum.
         levels: noise levels.
         priors: prior standard deviations of the constant errors.
-        placement: (F,) number of the placement that each capture shows; each its own without cameras.
+        placement: (F,) number of each capture's placement; without cameras, every capture has its own.
         captures: (F,) their names, sorted.
     """
 
@@ -263,7 +263,7 @@ def _maximise(
 ) -> JointEstimate:
     """Alternate between steps towards the optimum and fits of the noise levels.
 
-    Captures are weighted by their disagreement on the extrinsics, each of the placements (F,) as one.
+    Captures are weighted by their disagreement on the extrinsics; those of one placement (F,) share a weight.
     """
     held = priors.held
     now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
@@ -311,9 +311,9 @@ def descend(
         m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
 
     Args:
-        terms: to start from.
-        reduce: gives the normal equations of terms.
-        move: linearises terms anew after a step z (G,) and y (F, n).
+        terms: terms to start from.
+        reduce: returns the normal equations of terms.
+        move: linearises terms again after a step z (G,) and y (F, n).
         n_steps, short: maximum number of steps; length of the next one that ends them, in standard
             deviations of all unknowns.
 
@@ -361,7 +361,7 @@ def fit_levels(
 
     Args:
         terms: linearised near the optimum.
-        start: levels to start from.
+        start: initial levels.
         usual: centre of their prior; lasers without offsets there have none.
         priors: prior standard deviations of the constant errors.
         n_rounds: number of rounds of the search, at most.
@@ -457,7 +457,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
     """Weight captures (F,) so that those of one placement, which share its errors, count as one.
 
-    Of a placement that cameras saw in different numbers of captures, the smallest number counts.
+    If cameras saw a placement in different numbers of captures, the smallest number counts.
     """
     every = np.bincount(placement)[placement].astype(np.float64)
     fewest = np.full(len(placement), np.inf)
@@ -471,7 +471,7 @@ def extrinsics_by_unknowns(terms: Terms) -> Array:
     """Differentiate the cameras' reported extrinsics by the unknowns z: (C, 6, G).
 
     Straight ahead of the camera, a lens beside the axis equals a shift of the whole LiDAR. That shift is part
-    of the extrinsics, which apply to points as the driver gives them. They are used with the intrinsics of
+    of the extrinsics, which apply to points from the driver. They are used with the intrinsics of
     the same result: an error of these that projects like a rotation of the camera is part of them, too.
     """
     state, layout = terms.state, terms.state.layout

@@ -1,6 +1,6 @@
 """Likelihood of one camera's captures under assumptions other than those of its estimate.
 
-It serves to judge an estimate. Every placement has full weight, and the images' errors begin at their usual
+For judging an estimate. Every placement has full weight, and the images' errors begin at their usual
 levels. In the estimate, captures that contradict each other lose weight and raise the noise by which they are
 judged. No unknown is held, and priors have no tails.
 """
@@ -42,8 +42,8 @@ class Hypothesis:
     """F captures of one camera under M mountings, at the optimum.
 
     Attributes:
-        terms: linearised at the optimum; the images of each mounting are those of a camera. Those of a camera
-            that is the base are the last.
+        terms: linearised at the optimum; images of each mounting form a camera of their own. The camera
+            that is the base comes last.
         images: images of all mountings.
         levels: noise levels.
         priors: prior standard deviations of the constant errors.
@@ -103,7 +103,7 @@ class Hypothesis:
         Args:
             priors: prior standard deviations of the constant errors; the present ones by default.
             mounting: (F,) of the captures; the present one by default.
-            T_cam_lidar: (M, 4, 4) of each mounting, to start from.
+            T_cam_lidar: (M, 4, 4) initial extrinsics of each mounting.
         """
         old, terms, priors = self.state, self.terms, priors or self.priors
         if mounting is None or T_cam_lidar is None:

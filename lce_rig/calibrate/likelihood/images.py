@@ -26,9 +26,9 @@ class StackedImages:
     """One camera's board poses in P captures.
 
     Attributes:
-        capture: (P,) which of the stacked captures.
+        capture: (P,) index of the stacked capture.
         T_cam_board: (P, 4, 4).
-        cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
+        cov: (P, 6, 6) covariance of the tangent of T_cam_board by corner noise.
         shapes: (P, 6, 6) each, derivative of Q by the square of each of the levels `OF_IMAGES`.
         errors: (P, 6, 3 + n) tangents by which T_cam_board moves per unit of each constant error: squares,
             pattern and the n of the lens, as `layout.BOARD` and optics.
@@ -72,10 +72,10 @@ def stack_images(
     """Stack the images of one camera.
 
     Args:
-        capture: (P,) which of the stacked captures they belong to.
-        images: P of them, or poses by the first of two LiDARs, which have no lens.
+        capture: (P,) index of each one's stacked capture.
+        images: P boards in images; or poses by the first of two LiDARs, without a lens.
         pattern_offset_m: standard deviation of the pattern's centre from the plate's.
-        lens: whose errors are unknowns; None for a lens that is exact.
+        lens: lens whose errors are unknowns; None for an exact lens.
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])

@@ -163,7 +163,7 @@ class State:
     """Values of all unknowns.
 
     Attributes:
-        layout: their places.
+        layout: places of the unknowns.
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
         own_shift_m: (F,) shift of each capture's ring ends beyond that of all, like `SHIFTS`' d_0.
@@ -197,7 +197,7 @@ class State:
     @property
     def fields(self) -> Array:
         """(6,) displacement of the LiDAR's lens, bow of the plate along its width and height, relative error
-        of ranges, and their error by the print."""
+        of ranges, and their error by the pattern's contrast."""
         return self.z[self.layout.fields]
 
     @property

@@ -99,20 +99,20 @@ class Priors:
         growth: c, its change with range; recordings show none.
         background_m: d_1, d_2 and d_3, by the background of the edge.
         plate_m: errors of the plate's width and of its height.
-        displacement_m: displacement of all ring ends against the returns between them.
+        displacement_m: displacement of all ring ends relative to the returns between them.
         lateral_m: lens beside the LiDAR's axis, `rays`.
-        vertical_m: its height, per rad of elevation.
+        vertical_m: height of that lens, per rad of elevation.
         bow_m: height of the plate's middle over its ends, along its width and its height.
         azimuth_rad, elevation_rad: angles of each laser about their means, which are part of the extrinsics.
         stretch: relative error of ranges; held.
-        contrast_m: difference of ranges between dark and white parts of the print; held.
+        contrast_m: difference of ranges between dark and white parts of the pattern; held.
         beam: relative error of the beam's width and of its height, without rings.
-        known: the LiDAR's errors as measured before: means and standard deviations of lasers and lens.
+        known: the LiDAR's errors measured before: means and standard deviations of lasers and lens.
         squares: relative error of the squares' size.
         pattern_m: error of the pattern's place on the plate, to the right and up; held.
         optics: errors of each lens, in directions of unit variance; held.
         freedoms: degrees of freedom of Student's distribution of errors of squares, pattern and plate, as a
-            profile may be wrong by far; infinite for a normal distribution.
+            profile may be grossly wrong; infinite for a normal distribution.
     """
 
     offset_m: float = 0.005

@@ -380,7 +380,7 @@ def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
             sigmas[name] = np.full(len(layout.z.of([name])), priors.optics)
     if known is not None:
         mean[layout.z["lens"]], sigmas["lens"] = known.lens, known.lens_sigma
-        # Rings that are known: their indices among those seen, and among those known.
+        # Indices of the rings with known errors, among the rings seen and among the known ones.
         _, measured, which = np.intersect1d(terms.scans.rings, known.rings, return_indices=True)
     for name, sigma in sigmas.items():
         at = layout.z.of([name])

@@ -6,49 +6,49 @@ laser and displaced by f theta (the lens, below) and by the laser's errors a of 
     rho = r - n . (f theta + r u' a) / (n . u) + o + noise                                               (1)
 
 with u' the derivative of the ray by the two. A board's motion (tau, phi) about its middle t moves r by
-n . (tau + phi x (r u - t)) / (n . u). All that an estimate needs of the returns of a ring in a capture,
-however many there are, are the sums of products of
+n . (tau + phi x (r u - t)) / (n . u). An estimate needs, of all returns of a ring in a capture, only the sums
+of products of
 
     v = [n / (n . u); (r u - t) x n / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
 
 in columns of `layout.RING`.
 
 Ring ends. A ring's last ray on the board meets its plane s inside an edge, the next ray a step D
-farther out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d
+farther out along the edge's normal. Because of the beam's width, the board is lost where the ray passes d
 beyond the edge, measured across the beam; along the board that is g d, more the more obliquely it is seen:
 s + g d lies anywhere between 0 and D. The error
 
     e = s + g d - D / 2                                                                                  (2)
 
 in units of D has the density of `likelihood.end_density`. A beam that meets board and background reports the
-stronger echo: with q the share of the power that would come from the background if the beam met both alike,
+stronger echo: with q the fraction of the power from the background if the beam hit both equally,
 and r the range,
 
     d = d_0 + c r + d_1 q    where the background is far behind
     d = d_0 + c r + d_2 + d_3 q    where it is so near that both echoes blend into one                   (3)
 
-Recordings show d_1 near -17 mm, simulation -15 mm. A plate that is larger than its drawing shifts all edges
-alike by half as much; width and height have an unknown each.
-What is left, the same for all ring ends (a beam that is not symmetric, a clock of the rotor), is a small
-displacement of ring ends against the returns between them, along azimuth and upwards. Without rings, beams
-may be ten times as wide one way as the other: what half a beam's width adds along each edge's normal is
-subtracted by the search, in two parts for its two axes, and a relative error of each is unknown.
+Recordings show d_1 near -17 mm, simulation -15 mm. A plate larger than stated shifts each edge by half the
+excess; width and height have an unknown each. The remaining error, the same for all ring ends (an asymmetric
+beam, the rotor's clock), is a small displacement of ring ends relative to the returns between them, along
+azimuth and upwards. Without rings, beams may be ten times as wide one way as the other: what half a beam's
+width adds along each edge's normal is subtracted by the search, in two parts for its two axes, and a relative
+error of each is unknown.
 
-Lens. A spinning LiDAR sends its beams from a lens beside its axis, and drivers that do not know where place
-points as if they came from the axis. With e_a the direction of growing azimuth and alpha the elevation, a
-point lies at
+Lens. A spinning LiDAR sends its beams from a lens beside its axis, but drivers that ignore this place points
+as if the beams came from the axis. With e_a the direction of growing azimuth and alpha the elevation, a point
+lies at
 
     p + lateral e_a + vertical alpha e_z                                                                 (4)
 
 instead of p.
 
-Plate. No plate is flat. With n the board's normal, and h_w and h_h the height of one that is bent by 1 m
+Plate. Plates are never flat. With n the board's normal, and h_w and h_h the height of one that is bent by 1 m
 along its width or its height (`bow_heights`), a point p of the plate stands for the point of the plane at
 
     p - (bow_w h_w + bow_h h_h) n                                                                        (5)
 
-Ranges that are too long by a fraction, the stretch, and by another amount on the dark parts of the print than
-on the white ones, half the contrast either way, stand for the points
+Ranges that are too long by a fraction, the stretch, and by another amount on the dark parts of the pattern
+than on the white ones, half the contrast either way, stand for the points
 
     p - stretch p - contrast / 2 p / |p| on dark parts, + on white ones                                  (6)
 """
@@ -78,7 +78,7 @@ from lce_rig.core.results import LidarBoard
 
 # Typical noise of a cell's mean without rings.
 _MEAN_M = 0.008
-# Half a beam's width, and what the outline found in the scan may be off by.
+# Half a beam's width, and the error of the outline found in the scan.
 _BORDER_M = 0.02
 # Shortest step, m: on an edge parallel to its ring, a ring end has almost no step and determines the edge
 # less accurately.
@@ -92,17 +92,17 @@ class StackedScans:
     Attributes:
         n_captures: F.
         rings: (L,) ring numbers that occur.
-        capture, ring: (N,) of each return; `ring` is an index into `rings`.
+        capture, ring: (N,) indices of each return's capture, and of its ring in `rings`.
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
         fields: (N, 3, 6) displacement by (4) to (6), per unit of lens (2), bow (2), stretch and contrast.
         weight: (F,) inverse of each capture's noise of a return, relative to others; 1 with rings. Without, a
             "return" is the mean over a cell of the plate, whose noise was measured.
-        end_capture, end_ring: (M,) of each ring end, ordered by capture.
+        end_capture, end_ring: (M,) the same of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
-        end_fields: (M, 3, 6) as `fields`.
-        end_background: (M, 3) what is behind it, `describe_background`.
+        end_fields: (M, 3, 6) the same as `fields`, for ring ends.
+        end_background: (M, 3) the background there, see `describe_background`.
         end_beam: (M, 2) half the beam's width along the edge's normal, by the beam's two axes; 0 with rings.
         end_sigma: (M,) noise beyond that of a sharp border, m; 0 for a sharp one.
     """
@@ -228,8 +228,8 @@ def displacements(points: Array, T_lidar_board: Array, board: Board) -> Array:
     by_bow = -R[:, :, 2, None] * bow_heights(on_board, board)[:, None]
     side = np.where(is_dark(board, on_board[:, :2]), 0.5, -0.5)
     by_print = -(side / np.linalg.norm(points, axis=1))[:, None] * points
-    # The stretch moves points along their rays by shares of the model's ranges (`sum_ranges`): those measured
-    # have noise, which it would explain.
+    # The stretch moves points along their rays by fractions of the model's ranges (`sum_ranges`): measured
+    # ranges have noise, which the stretch would absorb.
     none = np.zeros((len(points), 3, 1))
     return np.concatenate([lens_fields(points), by_bow, none, by_print[..., None]], axis=2)
 
@@ -293,7 +293,7 @@ class RangeSums(NamedTuple):
 
     Attributes:
         sums: (F, L, 16, 16) in columns of `RING`, weighted by capture.
-        n_returns: (F, L) how many.
+        n_returns: (F, L) number of returns.
     """
 
     sums: Array
@@ -355,7 +355,7 @@ class EdgeRows:
         group: (M,) index of each end's pair of capture and ring, of F L in all; ascending.
         rows: (M, 28) in columns of `END`, e in m.
         step_m: (M,) D.
-        range_m: (M,) to the board.
+        range_m: (M,) range to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
         sigma_m: (M,) noise beyond that of a sharp border.
     """
@@ -383,7 +383,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     turned = turn_rays(scans.end_rays)
     off = scans.end_fields @ state.fields
     off += range_m[:, None] * np.einsum("mij,jm->mi", turned, state.lasers[1:, scans.end_ring])
-    # A displaced point is where its displaced ray meets the plane.
+    # A displaced point is the intersection of its displaced ray with the plane.
     off -= (np.sum(n * off, axis=1) / cosine)[:, None] * scans.end_rays
     here = range_m[:, None] * scans.end_rays - t + off
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off

@@ -6,7 +6,7 @@ T, the board's pose T_m T in the LiDAR's frame has the tangent
 
     B x + R y,    R the rotation of T_m, B = [I, -(R t)^; 0, I]                                          (1)
 
-The LiDARs share the shape of the plate; constant errors of lasers, lens and ring ends are each one's own.
+The LiDARs share the shape of the plate; each has its own constant errors of lasers, lens and ring ends.
 Loops of poses close, as each sensor has one.
 """
 
@@ -59,7 +59,8 @@ class RigTerms:
     """All residuals at one state.
 
     Attributes:
-        parts: of each of M LiDARs; the first is the base, and its terms hold the images. All have F captures.
+        parts: terms of each of the M LiDARs, over the same F captures. The first is the base; its terms
+            include the images.
         T_lidar_base: (M, 4, 4) pose of the base in each LiDAR's frame.
     """
 
@@ -216,7 +217,7 @@ class RigEstimate(Optimum):
     def lidar(self, m: int) -> tuple[Array, Array]:
         """Pose of the base in a LiDAR's frame: T_lidar_base (4, 4) as reported, and its derivative by z.
 
-        Both apply to points as the drivers give them, which lie beside the true ones by the lens.
+        Both apply to points from the drivers, which the lens displaces from the true ones.
         """
         J = np.zeros((6, self.terms.size))
         T = self.terms.T_lidar_base[m]
@@ -267,9 +268,9 @@ def maximise_rig(
         scans: scans of each LiDAR, of F captures; the first is the base.
         images: images of each camera, of the same captures.
         board: the board.
-        states: states of each LiDAR, to start from; the first one's with the cameras' extrinsics.
-        T_lidar_base: (M, 4, 4) to start from.
-        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated anew.
+        states: initial state of each LiDAR; the first includes the cameras' extrinsics.
+        T_lidar_base: (M, 4, 4) initial poses.
+        levels, priors: noise levels and priors of each LiDAR; the noise is not estimated again.
         placement: (F,) number of the placement that each capture shows.
     """
     once = weigh_placements(placement, images)

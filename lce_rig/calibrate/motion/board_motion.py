@@ -113,7 +113,7 @@ def sample_poses(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[
     together they count as one.
 
     Args:
-        scans: with their images; the first image's corners give the orientation of the others.
+        scans: scans with their images; the first image's corners give the orientation of the others.
         clocks: clock settings of the sensors.
         noise_px: corner noise by channel, replacing each image's own.
     """
@@ -152,7 +152,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     Args:
         samples: samples of F captures.
         offset_s: (C,) added to the images' times, by channel.
-        only: a channel that alone gives the board's position; the others then only give its motion.
+        only: channel that alone determines the board's position; the others then only determine its motion.
 
     References:
         The typical rates follow from expectation maximisation: Dempster, Laird, Rubin, "Maximum likelihood
@@ -281,7 +281,7 @@ def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
     """Move a board's points to their positions at the points' mean firing time.
 
     Args:
-        lidar: with firing times; without them nothing is moved.
+        lidar: board with firing times; without them nothing is moved.
         rates_lidar: (6,) tangent per second (m/s, rad/s) of the board about its middle, frame lidar.
     """
     if lidar.offset_ns is None:

@@ -41,8 +41,8 @@ MIN_MOVING = 6
 """Fewer captures with images of several times do not determine time offsets."""
 # Ratio of mean squared rates to noise above which boards moved.
 _MOVED = 1.0
-# Prior standard deviations of time offsets, s: without a tolerance in the profile; and without timestamps,
-# when an image may be from any time around its scan.
+# Prior standard deviations of time offsets, s: for a profile without a tolerance, and for images without
+# timestamps, which may have been taken at any time around the scan.
 _TOLERANCE_S, _NO_STAMPS_SIGMA_S = 0.05, 0.15
 _REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = 0.004
@@ -58,7 +58,7 @@ class Motion:
     """The boards of F scans, and their motion between the scan and its images.
 
     Attributes:
-        scans: with their images.
+        scans: scans with their images.
         samples: poses of the board in these.
         T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
         sweep_s: duration of a revolution of the LiDAR.

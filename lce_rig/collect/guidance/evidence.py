@@ -7,7 +7,7 @@ of the extrinsics by z,
 
     cov = J (sum_k H_k + P)^-1 J^T + M M^T                                                               (1)
 
-M moves the extrinsics by errors of the pattern's place on the plate, which a calibration holds.
+M is the effect on the extrinsics of the pattern's offset error on the plate, which a calibration keeps fixed.
 
 Many lasers are grouped: neighbours share one error of range and of angles, smaller by the square root of
 their number.
@@ -291,7 +291,7 @@ def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
 def few_captures_factor(n_captures: int) -> float:
     """Return the small-sample inflation factor of the covariance.
 
-    It is the factor of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
+    The factor is that of a leave-one-out covariance (`Quadratics.jackknife_covariance`), which diverges at
     `_N_UNKNOWNS` + 2 captures. With fewer than `_N_UNKNOWNS` + 3 it is extrapolated as 1/n. Few captures
     reveal neither noise nor outliers: with 6 to 8 captures of rlfs02, results differed from that of all 27
     by 0.2 deg, 2 to 3 standard deviations; with 10 captures by 0.1 deg.

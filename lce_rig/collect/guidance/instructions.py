@@ -30,9 +30,9 @@ class HeldPose:
         right_m: offset of its centre to the right of the camera's sight line, level.
         ahead_m: level distance from the camera along that line.
         up_m: height above the camera.
-        tilt_deg: angle by which the top leans towards the rig.
-        turn_deg: angle by which the person's left side is turned towards the rig.
-        roll_deg: turn in its plane, counter-clockwise as the camera sees it, 0 with level width.
+        tilt_deg: tilt of the top towards the rig.
+        turn_deg: rotation of the person's left side towards the rig.
+        roll_deg: rotation in its plane, counter-clockwise in the image, 0 with level width.
     """
 
     right_m: float

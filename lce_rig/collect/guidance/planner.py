@@ -34,7 +34,7 @@ class Coverage:
     Attributes:
         left_right, up_down: spread of the boards' positions in the image.
         near_far: ratio of the largest to the smallest distance.
-        tilt: a quarter for each of top, bottom, left and right that was towards the rig by `LEANS_DEG`.
+        tilt: a quarter for each of top, bottom, left and right that was tilted to the rig by `LEANS_DEG`.
         roll: range of the boards' rotations in their plane.
     """
 
@@ -51,7 +51,7 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
     Args:
         view: the sensors.
         held: (N, 4, 4) T_cam_board of the captures.
-        reachable: (M, 4, 4) T_cam_board that could be, `Planner.candidates`.
+        reachable: (M, 4, 4) T_cam_board of reachable placements, `Planner.candidates`.
     """
     if len(held) == 0:
         return Coverage(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -106,12 +106,12 @@ class Guidance(NamedTuple):
     Attributes:
         n_captures: number of captures.
         sigma_rotation_deg, sigma_translation_m: predicted standard deviations of the calibration now.
-        bound_rotation_deg, bound_translation_m: the same with a margin for few captures, which cannot show
-            how noisy they are; they have to be at most `ENOUGH_SHARE` of the target.
+        bound_rotation_deg, bound_translation_m: the same with a margin for few captures, which do not
+            reveal their noise; they have to be at most `ENOUGH_SHARE` of the target.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
         n_least: least number of captures.
         n_more: approximate number of further captures; 0 if there are enough, None if unknown.
-        T_cam_board: (4, 4) wanted; None if no reachable placement is new.
+        T_cam_board: (4, 4) the next placement; None if no reachable placement is new.
     """
 
     n_captures: int
@@ -144,8 +144,8 @@ class Planner:
 
     Args:
         view: the sensors, and the extrinsics as far as known.
-        min_move_m, min_turn_deg: placements moved and turned by less than this count as the same.
-        n_places: how many places of the board's centre are considered, with eight tilts each.
+        min_move_m, min_turn_deg: placements moved and rotated by less than this count as the same.
+        n_places: number of places of the board's centre that are considered, with eight tilts each.
     """
 
     def __init__(
@@ -180,11 +180,11 @@ class Planner:
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far; N may be 0.
-            present: (4, 4) where the board is now; of placements that are nearly as good the nearest wins.
-            avoid: (M, 4, 4) placements that cannot be reached, or where a sensor does not find the board:
-                something is in the way, so that others near them are not asked for either.
-            beside: other pairs of sensors: of placements that are nearly as good, the one that also helps
-                them wins.
+            present: (4, 4) pose of the board now; of nearly equal placements the nearest is chosen.
+            avoid: (M, 4, 4) placements that cannot be reached, or where a sensor does not detect the board;
+                those near them are not proposed either.
+            beside: other pairs of sensors: of nearly equal placements, the one that also helps them is
+                chosen.
         """
         model = self.view.model
         evidence = self._predictor.weigh(held)
@@ -288,7 +288,7 @@ class Planner:
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
-        # Compute by which fraction the present and the target placement reduce the improvable covariance.
+        # Fraction of the improvable covariance that the present and the target placement remove.
         placements = np.stack([present, wanted])
         model, evidence = self.view.model, self._predictor.weigh(held)
         now = self._predictor.combine(evidence).without_pattern
@@ -310,8 +310,8 @@ class Planner:
             cov: (6, 6) predicted now.
             improvable: (6, 6) the part of it that captures can shrink.
             then: (6, 6) that part after the next capture; None if no placement is new.
-            n_captures: so far.
-            n_least: captures needed at least.
+            n_captures: number of captures so far.
+            n_least: minimum number of captures.
         """
         model = self.view.model
         targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))

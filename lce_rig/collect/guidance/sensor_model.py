@@ -28,7 +28,7 @@ class SensorModel:
         pattern, width_rad: how its beams sweep the field of view, and its width; as `DataSheet` has them.
         limits: the profile's limits for a capture.
         target_sigma_rad, target_sigma_m: target standard deviations of the extrinsics.
-        priors, levels: of the likelihood's constant errors and noise; levels are learned from captures.
+        priors, levels: the likelihood's constant errors and noise levels; levels are learned from captures.
         inflation: factor by which the calibration of these captures widens its covariance, as they scatter.
     """
 
@@ -141,7 +141,7 @@ class SensorPlace:
         """Place the camera by the profile's nominal extrinsics.
 
         Raises:
-            ProfileError: it has none, or the beams of the LiDAR's model are not known.
+            ProfileError: there are none, or the beams of the LiDAR's model are not known.
         """
         nominal = rig.nominal(camera, lidar)
         if nominal is None:
@@ -236,7 +236,7 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
 
 
 def _is_in_lidar_view(view: SensorPlace, outline: Array) -> NDArray[np.bool_]:
-    """Find which outlines (N, K, 3), frame camera, the LiDAR sees: by rings mostly, otherwise entirely."""
+    """Check which outlines (N, K, 3), frame camera, the LiDAR sees: whole; with rings, `SEEN_SHARE`."""
     model, T_lidar_cam = view.model, invert(view.T_cam_lidar)
     if model.pattern != "rings":
         middle = outline.mean(axis=1, keepdims=True)

@@ -181,7 +181,7 @@ class CaptureWriter:
     def take(self) -> list[tuple[str, BoardDetection | None, float]]:
         """Return the captures saved or rejected since the last call, by name.
 
-        Each comes with its detection, None if it was taken back, and the time in s until it was safe.
+        With each its detection, None if it was taken back, and the time in s until it was saved.
 
         Raises:
             SessionError: a capture cannot be written: the disk is full, or gone.

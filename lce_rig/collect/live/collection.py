@@ -57,7 +57,7 @@ def collect_live(
     """Collect from attached sensors until there are enough captures.
 
     Args:
-        session: open for writing; its captures count.
+        session: session, open for writing; its captures count.
         sources: live sources of every sensor, and of the sync board if there is one; not open yet.
         options: options of the collection.
         show: receives the state after every frame, and twice a second without one; must not block.
@@ -146,7 +146,7 @@ class _Loop:
             if frame is not None:
                 detection = self._search.sight(frame)
                 if not self.report.n_frames:
-                    self._captured_s = time.monotonic()  # The search had to start first.
+                    self._captured_s = time.monotonic()  # not counting the start of the search
                 self.report.n_frames += 1
                 self._see(detection)
             key = keys()
@@ -234,7 +234,7 @@ class _Loop:
             return narration
         n_wanted = self._options.n_wanted
         if n_wanted is not None and self._n_before + len(self._asked) >= n_wanted:
-            return narration  # A slow disk still writes the last ones.
+            return narration  # the last captures may still be waiting for the disk
         present = detection.poses[guide.key]
         refusal = guide.adds_nothing(present)
         if refusal is None:
@@ -284,7 +284,7 @@ class _Loop:
             if not last:
                 self._monitor.cue("refused", "nothing to take back: no capture in this run")
             if not last or key.name not in ("", last):
-                return  # A tap that came late, or twice, means no other capture.
+                return  # A late or repeated tap must not reject another capture.
             # The capture may or may not be on the disk yet.
             taken = self._asked.pop()
             self._keeper.take_back(last)

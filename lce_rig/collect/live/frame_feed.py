@@ -26,8 +26,8 @@ class FrameFeed:
 
     Attributes:
         sensors: open.
-        clock: ties the timestamps.
-        losses: scans without an image of their time, and without events to make one of.
+        clock: converts the timestamps to the rig's clock.
+        losses: scans without an image of their time, or without events to reconstruct one.
     """
 
     def __init__(

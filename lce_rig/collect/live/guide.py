@@ -160,7 +160,7 @@ class Guide:
 
         Args:
             T_cam_lidar: (4, 4).
-            levels: noise levels, as estimated.
+            levels: estimated noise levels.
             inflation: factor by which the scatter of the captures widened the covariance.
         """
         if self._model is None:
@@ -187,7 +187,7 @@ class Guide:
 
         Args:
             present: (4, 4) T_cam_board now; None if the board is not seen.
-            now_s: by the sensors' clock.
+            now_s: current time of the sensors' clock.
             is_asked: whether the user follows this guide.
             others: other guides of the rig, whose sensors may see the board, too.
         """
@@ -347,7 +347,7 @@ def _channel_of(rig: Rig, sensor: str) -> str:
 
 _HOLD, _MOVE = "hold still", f"move it slowly, about {100 * BEST_SPEED_MPS:.0f} cm/s"
 _SHOW = "show the board to the camera"
-_ELSEWHERE = "hold it somewhere else, tilted otherwise"
+_ELSEWHERE = "hold it somewhere else, with another tilt"
 
 
 @dataclass(frozen=True)
@@ -368,7 +368,7 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
     """Explain why the board is not detected.
 
     Args:
-        detection: a sensor of the guide does not see the board in it, or not well enough.
+        detection: detection in which a sensor of the guide does not see the board well enough.
         guide: the guide of these sensors.
         reasons: the last refusal of each stream, by its name.
     """

@@ -165,7 +165,7 @@ class Monitor:
             return "enough", _ENOUGH, said.headline
         if self._is_stale():
             waited_s = time.monotonic() - self._seen_s
-            pair = "samples of one time" if self._is_of_one_kind else "image with a scan of its time"
+            pair = "simultaneous samples" if self._is_of_one_kind else "image with a simultaneous scan"
             return "searching", _WAIT, f"no {pair} for {waited_s:.0f} s"
         return said.phase, said.headline, said.detail or (self._met if is_enough else "")
 

@@ -1,8 +1,8 @@
 """The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
 
-The simulation runs in its own process, as real sensors do. While the board is held still, its scene is
-rendered once, and measured again for each image and scan; while it moves, it is rendered every time. If the
-computer is too slow, all runs in slow motion: sensors, timestamps and person share one simulated time.
+The simulation runs in its own process, as real sensors do. While the board is still, its scene is
+rendered once and measured for each image and scan; while it moves, it is rendered every time. If the
+computer is too slow, everything runs in slow motion: sensors, timestamps and person share one simulated time.
 """
 
 import math
@@ -129,7 +129,7 @@ class SimulatedRig:
         """Start the simulation and wait until it runs.
 
         Raises:
-            LceRigError: it does not.
+            LceRigError: the simulation fails to start.
         """
         with ExitStack() as stack:
             stack.enter_context(self._worker)
@@ -197,7 +197,7 @@ class _Simulation:
         self._walker.walk(self._stamp_ns * 1e-9)
         samples = list(self._scene.take(self._stamp_ns))
         self._stamp_ns += self._period_ns
-        # Do not compensate the delay of a slow turn by shorter ones.
+        # Do not make up for a slow cycle by shorter ones.
         self._due_s = max(self._due_s + self._period_ns * 1e-9, time.monotonic())
         return samples
 
@@ -264,8 +264,8 @@ class Walker:
         """Start towards a placement T_cam_board (4, 4), as far as the board can be held.
 
         Args:
-            camera: whose placement it is.
-            wanted: (4, 4).
+            camera: camera of the placement.
+            wanted: (4, 4) T_cam_board.
             now_s: simulated time.
         """
         view, T_world_cam = self._views[camera], self._scene.stage.T_world_sensor[camera]

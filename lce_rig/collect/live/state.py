@@ -66,13 +66,13 @@ class LiveReport:
 
     Attributes:
         ending: cause of its end.
-        is_enough: whether the session holds enough for the profile's target, as far as is known.
+        is_enough: whether the profile's target is predicted to be met.
         captured: names of the new captures, in order, without those taken back.
         taken_back: names of the captures that were taken back, in order.
         latencies_s: time from each decision until its capture was safe on the disk.
         n_frames: frames processed.
         n_lost: samples lost or dropped, by sensor.
-        error: the sensor that is lost for good; None if all are there.
+        error: error of the permanently lost sensor; None if there is none.
         notes: other remarks.
         predicted: the predicted standard deviations, for each camera and LiDAR with a prediction.
         n_recorded: samples of the raw streams on the disk; None if they were not recorded.
@@ -165,7 +165,7 @@ class LiveState(NamedTuple):
         headline: the one thing to do, large: "one step left, 0.5 m closer".
         detail: reason or progress, smaller; "" without either.
         hold_s: time that the board must still be held; None unless it is being held.
-        n_captures: in the session.
+        n_captures: number of captures in the session.
         n_wanted: target number of captures; None if the target accuracy decides.
         goes_on: approximate number of further captures, and why; "" if there are enough.
         last_capture: name of the capture that would be taken back; "" without one.
@@ -173,11 +173,11 @@ class LiveState(NamedTuple):
         drawing: the guiding camera's image; None before the first.
         coverage: coverage of the reachable placements by the captures; None without guidance.
         sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN with few captures.
-        target_deg, target_mm: the profile's.
+        target_deg, target_mm: the profile's targets.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
         notes: lasting remarks, in words.
-        requires_still_boards: whether boards must stand still, as `SyncVerdict` says.
+        requires_still_boards: whether boards must stand still, see `SyncVerdict`.
         n_logged: messages since the beginning, of which `log` holds the latest.
     """
 

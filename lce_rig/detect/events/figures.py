@@ -52,9 +52,9 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
     """Compute how many events a board caused; its motion stays unknown.
 
     Args:
-        events: about the image.
+        events: events around the time of the image.
         stamp_ns: timestamp of the image.
-        around_px: (M, 2) the board's outline in it.
+        around_px: (M, 2) the board's outline in the image.
     """
     outline = around_px[np.isfinite(around_px).all(axis=1)]
     mask = np.zeros((events.height_px, events.width_px), dtype=np.uint8)
@@ -95,7 +95,7 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
 
     Args:
         measured: figures of the board's events.
-        found: with its track.
+        found: the board, with its track.
         sweep_s: duration of the LiDAR's returns from the board; None without any.
     """
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
@@ -149,8 +149,8 @@ def gate_event_board(
 ) -> ImageBoard | Refusal:
     """Compare a board in an image from events with the profile's limits on events and motion.
 
-    A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
-    if they exceed the limit by two standard deviations.
+    Figures that could not be measured, and images reconstructed by other programs, are not judged. Speeds
+    must exceed the limit by two standard deviations.
 
     Args:
         found: the board with figures of its events.
@@ -187,7 +187,7 @@ def explain_missing_board(
     """Return the fault of the events that prevents a detection, or else `seen`.
 
     Args:
-        events: about the image.
+        events: events around the time of the image.
         stamp_ns: timestamp of the image.
         seen: the refusal, because the image is missing or has no board in it.
         limits: `quality` of the rig profile.

@@ -74,7 +74,7 @@ class ReconstructionModel:
 
         Args:
             voxels: (bins, H, W) normalised voxel grid.
-            states: as the last step or `initial_states` gave them.
+            states: those returned by the last step, or by `initial_states`.
 
         Returns:
             image (H, W), arbitrary scale; next states.
@@ -150,9 +150,9 @@ class _Window:
 class Reconstructor:
     """Runs the network over one event stream, with a recurrent state for the whole stream.
 
-    Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
-    asked for change the network's state: an image at a timestamp is a side step from the running state with
-    the events up to the timestamp.
+    Windows depend on the events alone, so that neither the batches in which events arrive nor the requested
+    timestamps change the network's state: an image at a timestamp is an extra step from the running state
+    with the events up to the timestamp.
 
     Args:
         channel: the channel of the images.
@@ -182,7 +182,7 @@ class Reconstructor:
 
         Args:
             batches: the stream from its beginning, in time order, cut anywhere.
-            stamps_ns: when images are wanted, never decreasing, the events' clock.
+            stamps_ns: times of the images, never decreasing, on the events' clock.
 
         Raises:
             SourceError: the batches are of different sensors or go back in time.
@@ -208,10 +208,10 @@ class Reconstructor:
         """Add the next events of the stream; `picture_at` returns its images.
 
         Args:
-            events: up to the next timestamp that an image will be asked for, or shorter.
+            events: events up to the next requested timestamp at most.
 
         Raises:
-            SourceError: they are of another sensor or go back in time.
+            SourceError: the events are of another sensor or go back in time.
         """
         if len(events):
             self._advance(self._take(events))

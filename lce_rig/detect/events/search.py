@@ -31,9 +31,10 @@ def nearest_pose(
 ) -> tuple[Array, Array]:
     """Choose the pose with the smallest rotation from T_near (4, 4) among those compatible with an image.
 
-    An image admits two poses. Without markers, the pattern looks the same when rotated by 180 deg, a square
-    one by 90 deg, except for the colours of its squares, which a reconstruction can have wrong: all such
-    turns of both poses are compared. The board must not rotate by half of that between the images.
+    The corners of one image fit two poses. Without markers, a pattern rotated by 180 deg (a square one by 90
+    deg) has the same corners, and the colours of its squares are unreliable in reconstructed images: all
+    these rotations of both poses are compared. Between the images, the board must rotate by less than half
+    of that angle.
 
     Returns:
         T_cam_board (4, 4) and its covariance (6, 6).
@@ -68,9 +69,9 @@ def find_event_board(
     """Reconstruct an image at a timestamp, find the board and track it backwards and forwards.
 
     Args:
-        events: from long enough before the timestamp for the network to settle.
-        stamp_ns: on the events' clock.
-        reconstructor: is reset.
+        events: events, from long enough before the timestamp for the network to settle.
+        stamp_ns: the timestamp, on the events' clock.
+        reconstructor: the reconstructor, which is reset first.
         board: the board as the profile describes it.
         intrinsics: intrinsics of the camera.
         limits: `quality` of the rig profile.
@@ -78,7 +79,7 @@ def find_event_board(
         frame_speed_mps: the board's speed in the camera's frames; NaN if unknown.
 
     Returns:
-        The image at that time, and the board in it with its track in those about it; or why there are none.
+        The image at that time, and the board in it with its track in the images around it; or the refusals.
 
     Raises:
         ProfileError: the intrinsics are for images of another size.

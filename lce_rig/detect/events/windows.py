@@ -52,7 +52,7 @@ def active_share(events: Events) -> float:
     """Compute the fraction of the sensor covered by the events: (sum n)^2 / (B sum n^2) over B blocks.
 
     The participation ratio depends only on the spread of the events, not on their number; with it a small
-    board before a still background gets windows of the same few pixels of motion as a full image.
+    board before a still background gets windows of the same motion in pixels as a full image.
     """
     if not len(events):
         return 1.0
@@ -163,8 +163,8 @@ class NoiseFilter:
 def hot_pixels(n_events: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Find hot pixels (H, W) from events per pixel over half a second or more, (H, W).
 
-    Real edges pass over neighbours too, whichever way they move; a hot pixel's neighbours stay quiet. The
-    median of the neighbours is blind to a second hot pixel next door.
+    Moving edges pass over neighbours, too; a hot pixel's neighbours stay quiet. The median of the
+    neighbours is insensitive to a second hot pixel among them.
     """
     import cv2
 
@@ -210,7 +210,7 @@ _FLICKER_COHERENCE = 0.5
 def is_flickering(events: Events) -> bool:
     """Check whether flickering or switched lamps caused most events of about a second.
 
-    All pixels that see such light turn brighter together, then darker; moving edges make both at any time.
+    Under such light, all pixels turn brighter together, then darker; moving edges cause both at any time.
     The root mean product of the polarities of two events of one millisecond separates the two.
     """
     if len(events) < 2:

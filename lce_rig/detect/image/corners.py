@@ -35,8 +35,8 @@ def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossing
 
     Args:
         grey: (H, W).
-        board: with the number of inner corners.
-        is_thorough: whether to go on after the quick attempts, which take a tenth of the total time.
+        board: defines the number and order of the inner corners.
+        is_thorough: whether to continue after the quick attempts, which take a tenth of the total time.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds all of them.
@@ -79,8 +79,8 @@ def seen_grid(grey: Grey) -> Array | None:
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
     """Sort a grid of corners into the order of `Board.corners()`, row by row from the pattern's top left.
 
-    A finder may start at any of the grid's ends. A camera looks at the front of the pattern, so the order
-    that turns from rows to columns clockwise in the image (v points down) is the one that is not mirrored.
+    A finder may start at any of the grid's ends. The camera sees the front of the pattern, so the unmirrored
+    order turns from rows to columns clockwise in the image (v points down).
     For a pattern that is not symmetric under 180 deg, the outer square at the top left is black by
     convention; for a symmetric one, the order with its top row up in the image is used.
 
@@ -124,8 +124,8 @@ def square_values(grey: Grey, grid_px: Array) -> Array:
 def _attempts(grey: Grey, size: tuple[int, int], is_thorough: bool) -> Iterator[Array | None]:
     """Run the finder at several scales, cheapest first; the caller stops at the first success.
 
-    The list is fixed, not timed, so that the same image gives the same answer on any machine. OpenCV's older
-    finder is not run: in 455 images of 17 recordings it found no board that these had missed.
+    The list does not depend on the time taken, so that the result is the same on any machine. OpenCV's older
+    finder is not used: in 455 images of 17 recordings it found no board that these had missed.
     """
     width = grey.shape[1]
     if width <= _WIDE_PX:
@@ -173,9 +173,9 @@ def to_full_scale(corners: NDArray[Any], scale: float) -> Array:
 def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
     """Find a grid of exactly the given size by linking saddle points of the grey values.
 
-    Each saddle point's two edges point at its neighbours, whose colours are inverted. Points that find each
-    other this way are linked, and the links are followed over the grid. If a corner is missing, or a false
-    one is linked, the function returns None and the finders take over.
+    Each saddle point's two edges point at its neighbours, whose colours are inverted. Pairs that point at
+    each other are linked, and the links are followed over the grid. If a corner is missing, or a false one is
+    linked, the function returns None and the finders take over.
 
     Args:
         grey: (H, W).
@@ -205,7 +205,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
 def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
     """Find the strongest saddle points, (N, 2) px, directions (N, 2, 2) of the two edges, and strengths (N,).
 
-    The quarter counter-clockwise of the first edge, as (u, v) are, is bright.
+    The quadrant counter-clockwise of the first edge, in the sense from u to v, is bright.
     """
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SADDLE_SIGMA_PX)
     duu, dvv = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
@@ -266,7 +266,7 @@ def _follow_links(
 ) -> dict[int, tuple[int, int]] | None:
     """Return (column, row) of the points of a connected grid of at least n_wanted; None if links disagree.
 
-    Corners of a grid have at least two neighbours; a point with fewer is linked by chance and dropped.
+    Corners of a grid have at least two neighbours; points with fewer are dropped as accidental.
     """
     while loose := [i for i, sides in links.items() if len(sides) < 2]:
         for i in loose:

@@ -1,7 +1,7 @@
 """Corners of ChArUco boards and AprilGrids: markers identify them, crossings locate them.
 
-OpenCV finds markers. Those whose places on the board agree with one pose predict every corner, and each is
-measured as a checkerboard's, by the edges about it. Corners that do not look as printed are hidden.
+OpenCV finds markers. Those that agree with one pose of the board predict every corner. Each corner is then
+measured like a checkerboard's, by the edges around it. Corners that do not look as printed count as hidden.
 """
 
 from collections.abc import Iterator
@@ -68,7 +68,8 @@ def find_marked_grid(
         is_thorough: whether to search at further scales, and for markers of other dictionaries.
 
     Returns:
-        Crossings with hidden corners at NaN; None without markers; a refusal if they are not the board's.
+        Crossings with hidden corners as NaN; None without markers; a refusal if the markers are not the
+        board's.
     """
     places = _search(grey, board, is_thorough=is_thorough)
     wanted = range(board.first_id, board.first_id + len(markers_of(board).ids))
@@ -100,12 +101,12 @@ def keep_marked(
 
     Args:
         grey: (H, W).
-        board: one that has markers.
-        crossings: fitted about the corners' former places.
-        was_seen: (rows, cols) which corners the board showed.
+        board: board with markers.
+        crossings: crossings fitted near the corners' previous positions.
+        was_seen: (rows, cols) corners visible in the previous image.
 
     Returns:
-        The crossings with hidden corners at NaN; None if a corner is lost, or many have come into view.
+        The crossings with hidden corners as NaN; None if a corner is lost, or many have come into view.
     """
     signs = _signs(board)
     signs *= np.sign(np.median((signs * crossings.contrast)[was_seen]))
@@ -197,8 +198,8 @@ def _family(dictionary: str) -> str:
 def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array | None, int, bool]:
     """Fit one pose to markers.
 
-    OpenCV's releases differ by half a turn in the first corner of AprilTags, and by the squares with markers
-    of a ChArUco board with an even number of rows: the reading that fits more markers is used.
+    OpenCV's releases differ in the first corner of AprilTags (by 180 deg), and in the squares with markers of
+    a ChArUco board with an even number of rows: the variant that fits more markers is used.
 
     Returns:
         The pose (4, 4); the number of markers that fit it; and whether the board is a ChArUco board of
@@ -309,7 +310,7 @@ def _measure(
             away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
             is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
             is_trusted, T_cam_board = is_seen, solved.T_cam_board
-        # Patches centred on their corners do not contain neighbouring print.
+        # Patches centred on their corners contain no neighbouring marks.
         grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
     crossings.grid_px[~is_seen] = np.nan
     crossings.is_fitted[...] = is_seen

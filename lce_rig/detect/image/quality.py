@@ -72,8 +72,8 @@ def _shortest_side_px(grid_px: Array) -> float:
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     """Check whether the grid of corners covers the whole pattern.
 
-    One row of squares surrounds the outermost corners. It must alternate like the inner squares, and the
-    next row outwards must not.
+    The row of squares around the outermost corners must alternate like the inner squares; the next row
+    outwards must not.
 
     Args:
         grey: (H, W) the image.
@@ -147,11 +147,11 @@ def explain_other_grid(
 ) -> Refusal:
     """Report that the image shows a grid of another size than the profile's, or only part of it.
 
-    The number of corners detected is stated only if they are a whole pattern.
+    The number of detected corners is stated only for a whole pattern.
 
     Args:
         grey: (H, W) the image.
-        board: the board wanted.
+        board: the expected board.
         seen_px: (rows, cols, 2).
         is_from_events: whether the image was reconstructed from events.
     """

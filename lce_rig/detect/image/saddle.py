@@ -49,7 +49,7 @@ class Patches(NamedTuple):
     Attributes:
         e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
         e2_px: (rows, cols, 2) one unit down on the board.
-        clear: distance from an edge, in units, up to which the surroundings are free of other print.
+        clear: distance from an edge, in units, up to which there are no other marks.
     """
 
     e1_px: Array
@@ -70,12 +70,12 @@ def fit_crossings(
     profile erf(x / sqrt 2) of an edge under Gaussian blur. The two blurs are separate: motion blurs one more.
 
     Unlike `cv2.cornerSubPix`, whose window must be square and hold one corner, the patch follows the squares
-    down to the few pixels of tilted and far ones.
+    down to the few pixels of tilted and distant ones.
 
     Args:
         grey: (H, W).
         grid_px: (rows, cols, 2) corners to within a third of a square.
-        most_samples: per side of a patch; of fewer a fit is faster and noisier.
+        most_samples: maximum number of samples per side of a patch; fewer make a fit faster and noisier.
         patches: for patterns other than checkerboards.
     """
     n_coarse = min(_COARSE_SAMPLES, most_samples)
@@ -176,7 +176,7 @@ def _fit(
 ) -> tuple[Array, Array]:
     """Fit all patches (K, n): parameters (K, 8) a0 b0 alpha beta m c log(s1) log(s2), residuals (K, n).
 
-    `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
+    `start` holds parameters of an earlier fit, after which the patches were centred on their corners.
     """
     # Without a start the corners are assumed at the centres of their patches.
     mean = values.mean(axis=1)

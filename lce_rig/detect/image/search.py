@@ -60,8 +60,8 @@ def find_image_board(
 ) -> ImageBoard | Refusal:
     """Find the board's inner corners in one image and T_cam_board in both its minima.
 
-    Corners are in the order of `Board.corners()`. A pattern that is not symmetric under 180 deg is read with
-    the outer square at its top left black; a symmetric one with its top row up in the image. Of a board with
+    Corners are in the order of `Board.corners()`. A pattern that is not symmetric under 180 deg has a black
+    outer square at its top left; a symmetric one is read with its top row up in the image. For boards with
     markers, which identify the corners, a part is sufficient.
 
     Args:
@@ -126,7 +126,7 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`, NaN where hidden.
-        solved: both poses that they admit.
+        solved: both poses that fit the corners.
         quality: figures of the image.
     """
     return ImageBoard(**solved._asdict(), corners_px=corners_px, quality=quality)
@@ -173,7 +173,7 @@ def _follow(
 ) -> Crossings | None:
     """Fit the corners from their positions in the previous image; None unless the board is complete.
 
-    A board that moved by a whole square is not mistaken for itself, as squares are missing on one side.
+    A board that moved by a whole square is rejected, as squares are missing on one side.
     """
     start_px, patches = last.corners_px.reshape(board.rows, board.cols, 2), None
     was_seen = np.asarray(np.isfinite(start_px).all(axis=-1))
@@ -221,9 +221,9 @@ def _solve(
 ) -> tuple[PlanarPose | None, Crossings]:
     """Solve for the pose; search corners far from their predicted positions again.
 
-    A finder puts single corners onto an artefact now and then. If they are few, they are fitted again from
-    the places that the others predict; a corner whose fit fails there takes that place and no longer counts
-    in `n_corners`.
+    Finders occasionally place single corners on an artefact. If they are few, they are fitted again from the
+    positions predicted by the others. A corner whose fit fails there keeps the predicted position and is not
+    counted in `n_corners`.
     """
     corners_board = board.corners()
     solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics, near)

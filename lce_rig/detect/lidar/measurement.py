@@ -39,7 +39,7 @@ class RingEnds(NamedTuple):
         side: (E,) -1 or +1.
         gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
         beyond: (E,) index in the scan of the next return outwards.
-        behind_m: (E,) how far behind the plane it lies, inf if there is none.
+        behind_m: (E,) its distance behind the plane, inf if there is none.
         is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
     """
 
@@ -64,7 +64,7 @@ def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool
     Args:
         scan: all returns.
         view: beams about the board.
-        is_board: (M,) which of them return from it.
+        is_board: (M,) beams that return from it.
     """
     board = np.flatnonzero(is_board)
     ring = scan.ring[view.member[board]]
@@ -107,13 +107,13 @@ def measure_size(
     """Fit a rectangle of free size to the ring ends by least squares of their distance from the nearest edge.
 
     An end lies half a step of the ring inside the edge on average, and half a light spot outside
-    (`beyond_m`); both along the edge's normal. A weak prior holds a side that no end shows.
+    (`beyond_m`); both along the edge's normal. A weak prior determines sides without ring ends.
 
     Args:
         ends: ring ends.
         uv: (M, 2) of the plane view, m.
         placement: placement of the rectangle with the nominal size.
-        beyond_m: how far the light spot reaches over an edge.
+        beyond_m: reach of the light spot beyond an edge.
 
     Returns:
         The fitted rectangle, the standard deviation of its width and height (2,), the residuals (E,) in m,
@@ -167,8 +167,8 @@ def measure_size(
 def measure_smear(ends: RingEnds, side: Indices, residual_m: Array, step_m: Array) -> Array:
     """Measure the scatter of ring ends about the border beyond their steps: (E,) m, 0 for a sharp border.
 
-    It is the third quartile of the distances, of all ends and of each side's. So a few ends that lost their
-    last returns do not count, nor do those of rings that hardly cross the nearest side.
+    It is the third quartile of the distances, of all ends and of each side's. Few ends without their
+    last returns therefore do not count, nor do those of rings that hardly cross the nearest side.
 
     Args:
         ends: ring ends.
@@ -205,8 +205,8 @@ class Beam:
 
     Attributes:
         aperture_m: width of the beam at the sensor's exit.
-        divergence_rad: full angle by which it widens.
-        upright_rad: the same upwards; None for the same as sideways.
+        divergence_rad: full divergence angle.
+        upright_rad: vertical divergence angle; None if equal to the horizontal one.
     """
 
     aperture_m: float = VLP_16.aperture_m
@@ -226,9 +226,9 @@ class Beam:
 def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple[Array, float]:
     """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
 
-    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
-    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales of
-    the returns' scatter about the first plane.
+    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would rotate
+    the plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales
+    of the returns' scatter about the first plane.
 
     Args:
         points: (N, 3) m, frame lidar.
@@ -275,7 +275,7 @@ def refine(
         placement: first guess of the outline.
         limit_m: largest error of an outline; a worse one is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, for further work.
-        dark_m, may_be_hidden: as in the view.
+        dark_m, may_be_hidden: see `PlaneView`.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None if too few returns lie
@@ -321,7 +321,7 @@ def build_board(
         beam: light spot of the LiDAR.
 
     Returns:
-        The board, None if hardly a return lies inside the outline.
+        The board; None if hardly any return lies inside the outline.
     """
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
@@ -363,7 +363,7 @@ def build_board(
         beyond_share=float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
         distance_m=distance_m,
     )
-    # The share of the power that comes from behind where a beam meets it and the board alike. Intensities
+    # Fraction of the power from the background if a beam hits it and the board equally. Intensities
     # are those of surfaces; the power received falls with the square of the range.
     intensity = source.intensity[scan.index].astype(np.float64)
     of_board = float(np.median(intensity[border])) if len(border) else 0.0

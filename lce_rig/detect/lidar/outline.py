@@ -1,13 +1,13 @@
 """Fit a rectangle to rays near a plate, by the likelihood of returns on the plate and beside it.
 
-A ray that meets the plate's plane at u returns from the plate with the probability
+A ray that hits the plate's plane at u returns from the plate with the probability
 
     P(u) = eps + (1 - 2 eps) prod_e Phi(-s_e(u) / w_e)                                                    (1)
 
 with s_e the distance beyond side e and w_e the blur across it: half the beam's width there and the noise of
 directions. Rays that return from behind, or from nowhere, passed beside the plate; those that return from
-before it say nothing. The unknowns are the rectangle's place, turn, and the growth of its width and height,
-as beams wider than a point return from a plate that they only touch.
+before it are not used. The unknowns are the rectangle's position, rotation, and excess width and height:
+wide beams return from a plate that they only graze.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ class Rays:
     """M rays that intersect a plate's plane.
 
     Attributes:
-        uv: (M, 2) points of intersection with the plane, m.
+        uv: (M, 2) intersections with the plane, m.
         is_on: (M,) whether they return from the plane; else they passed beside the plate.
     """
 
@@ -60,7 +60,7 @@ class Outline(NamedTuple):
     """A rectangle fitted to rays.
 
     Attributes:
-        placement: with the nominal size; `error_m` is the mean of -ln P over the rays near the border.
+        placement: fit of the nominal size; `error_m` is the mean of -ln P over the rays near the border.
         growth_m: (2,) excess of half its width and half its height over the nominal ones.
         cov: (5, 5) of u, v, angle and growth.
     """
@@ -73,7 +73,7 @@ class Outline(NamedTuple):
 def thin(n: int, most: int) -> Indices:
     """Choose about `most` of n returns at random, with a fixed seed; all if there are fewer.
 
-    Regular steps would select only a few of a LiDAR's lines, which recur in order and share errors.
+    A fixed step would select only a few of a LiDAR's lines, which recur in order and share errors.
     """
     if n <= most:
         return np.arange(n)
@@ -90,8 +90,8 @@ def fit_outline(
     """Maximise (1) over position, rotation and growth by Fisher scoring.
 
     Args:
-        rays: about the plate.
-        start: a few centimetres and degrees off at most.
+        rays: rays near the plate.
+        start: initial placement, within a few centimetres and degrees.
         blur_m: w for unit normals (..., 2) of the plane view.
         growth_m: prior mean (2,) and standard deviation of the growth.
         annealed_m: least blurs of the first rounds.
@@ -136,7 +136,7 @@ def fit_outline(
 def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
     """Fit the rectangle from all angles about the origin; return the two best placements, best first.
 
-    `error_m` is the share of rays that contradict a placement, per return on the plate.
+    `error_m` is the ratio of rays that contradict the placement to returns on the plate.
 
     Args:
         rays: about a plate whose middle is near the origin.
@@ -197,7 +197,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         blur_m: as in `fit_outline`.
 
     Returns:
-        (4,) of the right, left, top and bottom side.
+        (4,) smear of the right, left, top and bottom side.
     """
     placement = outline.placement
     near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
@@ -255,7 +255,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         rays: about the plate.
         outline: fitted to them.
         blur_m: as in `fit_outline`.
-        smears_m: (4,) of the sides' borders, beyond that blur.
+        smears_m: (4,) smear of the sides' borders, beyond that blur.
     """
     from scipy.special import ndtr
 

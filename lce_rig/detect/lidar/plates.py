@@ -13,7 +13,7 @@ from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 MAX_PAIRS = 400
 CELL = 0.5  # of the board's diagonal: with too many pairs, those of one cell count as alike
 N_ROUNDS = 2
-BLOCK = 32  # of centres, whose distances fit the cache
+BLOCK = 32  # number of centres whose mutual distances fit the cache
 MAX_PLATES = 10
 MIN_LONG = 4  # minimum number of chords across the plate that locate it beside a stand
 MAX_JOINT = 4  # maximum returns between two segments of one chord: noise, a hand's edge, a dropped firing
@@ -60,17 +60,17 @@ def propose_plates(
 ) -> tuple[Plates, Array]:
     """Grow plates from pairs of neighbouring segments; keep distinct ones of plausible size.
 
-    Each pair of parallel segments on neighbouring rings spans a plane. A plane takes all segments in reach
-    that lie in it and is fitted again to their sums, a few times over, for all planes at once.
+    Each pair of parallel segments on neighbouring rings spans a plane. All segments in reach that lie
+    in a plane are assigned to it, and it is refitted to their sums, a few times, for all planes at once.
 
     Args:
-        scan: gives the noise.
+        scan: scan, for the noise.
         segments: straight segments of all lengths.
-        board: gives the reach.
+        board: board, for the reach.
         is_any_size: whether to keep plates that cannot be the board.
 
     Returns:
-        The plates, and the first and last return of their segments (K, M, 3) in m; NaN fills the rows up.
+        The plates, and the first and last return of their segments (K, M, 3) in m; rows are padded with NaN.
     """
     diagonal_m = float(np.hypot(board.width_m, board.height_m))
     tolerance_m = 2.0 * scan.sigma_m + 0.01
@@ -121,7 +121,7 @@ def _facing_planes(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Place a plane (K, 4) through each pair's line, perpendicular to the beam, for pairs lost in noise.
 
-    Where the noise is as large as the distance between two rings, their plane is arbitrary; this one is near
+    If the noise is as large as the distance between two rings, their plane is arbitrary; this one is close
     enough to collect the rings beyond them.
     """
     direction = segments.direction[first]
@@ -164,7 +164,7 @@ def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tup
 def _spread_out(centres: Array, cell_m: float) -> Indices:
     """Choose MAX_PAIRS of the pairs at centres (P, 3), best first but distributed over the scan.
 
-    Dense rings place hundreds of pairs on every wall and floor, and all of them grow to the same few planes.
+    Dense rings give hundreds of pairs on every wall and floor, which all grow into the same few planes.
     Therefore each cell of space contributes its best pair before any cell contributes its second.
     """
     cell = np.unique(np.floor(centres / cell_m), axis=0, return_inverse=True)[1].ravel()
@@ -270,10 +270,10 @@ def screen_plates(
 
     Args:
         plates: K of them.
-        ends: (K, M, 2) as of `propose_plates`.
-        board: gives the rectangle.
+        ends: (K, M, 2) ends from `propose_plates`.
+        board: board, for the rectangle.
         limit_m: largest error of an outline.
-        on_stand: whether to leave out chords shorter than half the board's short side: a stand flush with the
+        on_stand: whether to skip chords shorter than half the board's short side: a stand flush with the
             plate is narrower than the plate, and its chords end elsewhere.
     """
     if len(plates.centre) == 0:

@@ -32,7 +32,7 @@ from lce_rig.detect.lidar.template import (
 
 # Fraction of returns beyond the outline, in the board's plane, above which something touches the board.
 TOUCHING_SHARE = 0.10
-SCATTER_M = 0.02  # scatter added to the LiDAR's noise in the search for plates to name
+SCATTER_M = 0.02  # added to the LiDAR's noise in the search for plates to report
 # Maximum sum of |log| of the ratios of long and short side for a plate to be reported.
 MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
@@ -71,8 +71,8 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
     """Refuse a board whose returns scatter more about its plane than the LiDAR's noise explains.
 
     Args:
-        heights_m: (N,) of the returns over the plane.
-        limit_m: largest rms of them.
+        heights_m: (N,) distances of the returns from the plane.
+        limit_m: largest rms distance.
     """
     return LIDAR_TOO_THICK.refusal(plane_rms_m=float(np.sqrt(np.mean(heights_m**2))), max_plane_rms_m=limit_m)
 
@@ -110,7 +110,7 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
     Args:
         scan: all returns.
         board: the board searched for.
-        limits: with the scan's noise.
+        limits: limits, including the scan's noise.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
     segments = cut_segments(coarse, limits.max_range_m)
@@ -168,8 +168,8 @@ def find_lidar_boards(
 
     Args:
         scan: one revolution, or part of one.
-        board: for its outer size.
-        limits: without noise.
+        board: board, which defines the outer size.
+        limits: limits, not including the scan's noise.
 
     Returns:
         At most 4 boards that do not overlap, or the refusal.
@@ -219,7 +219,7 @@ def measure_plate(
         board: nominal size.
         start: first guess of the plane (4,) as (n, d), its point (3,) in m that is the outline's origin, and
             the outline.
-        limits: with the scan's noise.
+        limits: limits, including the scan's noise.
         max_beyond: largest share of returns in the plane beyond the guessed outline.
 
     Returns:
@@ -263,15 +263,15 @@ def _past_dark_squares(
 ) -> tuple[PlaneView, Placement] | None:
     """Register the outline of a board whose dark squares, at grazing incidence, return nothing or too far.
 
-    Such beams do not locate the outline; the others must fit it as without noise. Of boards at 42 to
+    Such beams do not locate the outline; the others must fit it as if there were no noise. Of boards at 42 to
     66 deg before a VLP-16 and a VLP-32C, 12 to 41 % of the beams are lost; of walls and tables at most 9 %.
 
     Args:
         scan: all returns.
-        board, start, limits, max_beyond: as in `measure_plate`.
+        board, start, limits, max_beyond: see `measure_plate`.
 
     Returns:
-        As `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.
+        See `refine`; None if the beams do not graze the plate, too few are lost, or the outline does not fit.
     """
     plane, centre, _ = start
     if plane[3] > np.cos(GRAZING_RAD) * np.linalg.norm(centre):
@@ -322,9 +322,9 @@ def look_for_board(
 
     Args:
         scan: one revolution.
-        board: for its outer size.
+        board: board, which defines the outer size.
         T_lidar_board: (4, 4) predicted.
-        limits: without noise; the search has no maximum range.
+        limits: limits, not including the scan's noise; their maximum range is not used.
 
     Returns:
         The board, or the refusal.

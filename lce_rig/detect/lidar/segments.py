@@ -22,7 +22,7 @@ RANGE_NOISE_FLOOR_M = 0.004
 class OrderedScan:
     """The usable returns of a scan, sorted by ring and then by azimuth.
 
-    Each ring starts at a gap or range jump, so that the seam at azimuth +-pi cuts no surface in two.
+    Each ring starts at a gap or range jump, so that the seam at azimuth +-pi does not split a surface.
 
     Attributes:
         index: (N,) index of each return in the original scan.
@@ -132,8 +132,8 @@ def _since_previous(values: Floats, starts: Indices) -> Floats:
 def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Indices:
     """Sort each ring's returns, given in firing order, by azimuth; drop those of a second revolution.
 
-    A scan of slightly more than one turn has the same directions twice, 0.1 s apart; mixed, they would split
-    moving objects in two. Point clouds that are not in order of firing lose nothing.
+    A scan of slightly more than one revolution has the same directions twice, 0.1 s apart; mixed, they would
+    split moving objects. Point clouds that are not in order of firing stay complete.
     """
     if len(order) == 0:
         return order

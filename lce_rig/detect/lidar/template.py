@@ -27,7 +27,7 @@ class PlaneView:
         axes: (3, 2) unit vectors u (level) and v (up) in the plane, right-handed with n.
         origin: (3,) m, the point of the plane from which u and v are counted.
         member: (M,) index among all returns.
-        uv: (M, 2) where each beam pierces the plane, m.
+        uv: (M, 2) intersection of each beam with the plane, m.
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
         dark_m: longest way across a dark square whose beams return nothing, or weakly from too far; 0 where
@@ -72,7 +72,7 @@ class Placement:
         u_m, v_m: its centre.
         angle_rad: angle of its width axis from u.
         half_m: half width and half height.
-        error_m: how far the beams contradict it: mean capped distance of the chords' ends from the border,
+        error_m: contradiction by the beams: mean capped distance of the chords' ends from the border,
             plus the cap for each beam that contradicts it elsewhere, per chord end or beam on the plane.
     """
 
@@ -123,11 +123,11 @@ def view_plane(
 
     Args:
         points: (N, 3) m, all returns.
-        among: (K,) of them that are tried.
+        among: (K,) indices of those examined.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
         radius_m: radius of the disc examined.
-        tolerance_m, dark_m: as in the view.
+        tolerance_m, dark_m: see `PlaneView`.
     """
     normal, d = plane[:3], plane[3]
     origin = centre - (centre @ normal + d) * normal
@@ -158,7 +158,7 @@ def plane_axes(normal: Array) -> Array:
 def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Indices, Indices]:
     """Find on each ring the run of returns from the plane that overlaps most with the placed rectangle.
 
-    Other runs of the ring belong to other things that happen to lie in the plane.
+    Other runs of the ring belong to other objects that happen to lie in the plane.
 
     Args:
         scan: all returns.
@@ -205,7 +205,7 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
     Args:
         scan: all returns.
         view: beams about the plate.
-        start: first guess; gives the size.
+        start: first guess, which sets the size.
 
     Returns:
         The placement, None if no ring shows the plate.
@@ -281,8 +281,8 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
     """For each of G plates, find the board placement whose border is nearest to the plate's ends.
 
     Args:
-        ends: (G, M, 2) start and end of the rings in each plate's plane, m; NaN fills the rows up.
-        board: gives the rectangle.
+        ends: (G, M, 2) start and end of the rings in each plate's plane, m; rows are padded with NaN.
+        board: board, for the rectangle.
     """
     half = (board.width_m / 2, board.height_m / 2)
     is_unused = np.isnan(ends[..., 0])

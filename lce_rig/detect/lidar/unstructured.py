@@ -89,8 +89,8 @@ def find_unstructured_boards(
 
     Args:
         scan: one scan, or several of a still board together.
-        board: for its outer size.
-        limits: without noise.
+        board: board, which defines the outer size.
+        limits: limits, not including the scan's noise.
     """
     points = np.asarray(scan.points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -149,7 +149,7 @@ def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[
 def grow_patches(points: Array, cell_m: float) -> Plates:
     """Join neighbouring cells of points (N, 3) that lie in one plane, the largest patch first.
 
-    Each cell's plane is that of its points and those of the cells about it.
+    Each cell's plane is fitted to its points and those of neighbouring cells.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -212,7 +212,7 @@ class _View(PlaneView):
 
     Attributes:
         returns: (M, 4) x, y, z, intensity; intensities are all the same if the point cloud has none.
-        beam: the LiDAR's.
+        beam: the LiDAR's beam.
     """
 
     returns: Array
@@ -263,7 +263,7 @@ class _View(PlaneView):
         """Separate rays that return from the plate from those that pass beside it.
 
         Rays that return from before the plane, or just behind it where echoes of plate and background blend,
-        are left out, except that a stand or a touching object ends the plate. Places without any return count
+        are skipped, except that a stand or a touching object ends the plate. Places without any return count
         as passed, unless they lie on a first placement.
 
         Args:
@@ -287,7 +287,7 @@ class _View(PlaneView):
 def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array, float]:
     """List cells (K, 2) in and near a placement without rays, themselves and neighbours; and their size.
 
-    Cells are so large that four returns are due in each.
+    Cells are large enough that four returns are expected in each.
     """
     from scipy.ndimage import maximum_filter
 
@@ -311,8 +311,8 @@ def measure_unstructured(
         returns: (N, 4) x, y, z, intensity.
         board: nominal size.
         plane: (4,) first guess.
-        centre: (3,) m, about the plate's middle.
-        limits: without noise.
+        centre: (3,) m, near the plate's middle.
+        limits: limits, not including the scan's noise.
     """
     distance_m = float(np.linalg.norm(centre))
     if plane[3] < np.cos(MAX_INCIDENCE_RAD) * distance_m:
@@ -527,7 +527,7 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
 def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
     """Average the returns in cells of the plate; also return the effective noise of one mean.
 
-    Errors of neighbouring returns are alike: they follow the squares, glare and incidence. The means in
+    Errors of neighbouring returns are similar: they follow the squares, glare and incidence. The means in
     coarse cells are nearly independent; their scatter is scaled to the number of fine cells.
 
     Args:

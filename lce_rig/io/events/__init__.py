@@ -38,12 +38,12 @@ def open_events(
 
     Args:
         path: an AEDAT4, Prophesee .raw or HDF5 file, or a ROS 1 or ROS 2 bag.
-        sensor: name of the camera that its events are taken for.
-        resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
-        topic: topic of a bag; None takes the only one with events.
+        sensor: name of the camera to assign the events to.
+        resolution: (width, height) px of that camera; None for the file's, or the extent of its events.
+        topic: topic of a bag; None for the only one with events.
 
     Raises:
-        SourceError: nothing is there, nothing that can be read, no events, or those of a camera of another
+        SourceError: the path is missing or unreadable, or has no events or those of a camera of another
             resolution.
     """
     path = Path(path)
@@ -74,8 +74,8 @@ class EventCameraFile:
         """Open the file.
 
         Raises:
-            SourceError: it cannot be read or holds nothing, the rig has no event camera, or the events are
-                of another resolution than its.
+            SourceError: the file cannot be read or is empty, the rig has no event camera, or the events have
+                another resolution.
         """
         self.path = path
         self.notes: list[str] = []

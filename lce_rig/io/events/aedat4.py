@@ -69,7 +69,7 @@ class Aedat4File:
         """Read the header.
 
         Raises:
-            SourceError: it is not an AEDAT4 file, or its header is damaged.
+            SourceError: not an AEDAT4 file, or its header is damaged.
         """
         self.path = path
         self.notes: list[str] = []
@@ -138,8 +138,8 @@ class Aedat4Events(EventStream):
         """Read the header and take the first stream of events.
 
         Raises:
-            NoEventsError: it has no events.
-            SourceError: it is not an AEDAT4 file.
+            NoEventsError: the file has no events.
+            SourceError: not an AEDAT4 file.
         """
         self._file = Aedat4File(path)
         number = self._file.first_stream("events")

@@ -86,8 +86,8 @@ def to_ns(times_us: NDArray[Any], offset_us: int = 0) -> NDArray[np.int64]:
 class EventRecording:
     """Events of one camera from one file or topic.
 
-    Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
-    them in memory; it may be done again and again. Timestamps are the sensor's own.
+    Iterating yields stretches of `Events` from the beginning, in order of time, with only a few of them in
+    memory; it can be repeated. Timestamps are the sensor's own.
 
     Attributes:
         path: the file or folder.
@@ -109,7 +109,7 @@ class EventRecording:
 
         Raises:
             NoEventsError: no events.
-            SourceError: those of a camera of another resolution.
+            SourceError: the events are of a camera of another resolution.
         """
         self.path = path
         self.sensor = sensor
@@ -145,7 +145,7 @@ class EventRecording:
     def tie_to_host(self) -> None:
         """Convert timestamps relative to the sensor's start to the host's clock, if arrivals are known.
 
-        The shift is the least difference among the first packets: the one that waited least.
+        The shift is the smallest difference among the first packets, from the least delayed one.
         """
         start_ns = self.start_ns
         delays_ns = [
@@ -164,7 +164,7 @@ class EventRecording:
         """Yield the events from the beginning, in the order of time.
 
         Raises:
-            SourceError: the timestamps run back for good, or events lie off the sensor.
+            SourceError: the timestamps go back permanently, or events lie off the sensor.
         """
         losses = Losses()
         try:
@@ -227,7 +227,7 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
     Events are held back until the next stretch shows that nothing earlier follows.
 
     Raises:
-        SourceError: the timestamps run back for good; everything before has been yielded.
+        SourceError: the timestamps go back permanently; everything before has been yielded.
     """
     held, delivered_ns = NO_EVENTS, 1 - MAX_TIME_NS
     for stretch in stretches:

@@ -52,7 +52,7 @@ class Hdf5Events(EventStream):
         """Yield the events a million at a time.
 
         Raises:
-            SourceError: they are compressed by a filter that is not installed, or damaged.
+            SourceError: the events are damaged, or compressed by a filter that is not installed.
         """
         with _open(self._path) as file:
             columns = _columns(file)
@@ -92,7 +92,7 @@ def _columns(file: Any) -> list[Any]:
     """Find the columns t, x, y and p, each of which reads a slice as an array (N,).
 
     Raises:
-        ValueError: there are none.
+        ValueError: a column is missing.
     """
     table = _find(file, _TABLE)
     if {*_FIELDS} <= {*(getattr(getattr(table, "dtype", None), "names", None) or ())}:
@@ -103,15 +103,15 @@ def _columns(file: Any) -> list[Any]:
 
 
 def _find(group: Any, name: str, most_links: int = _MOST_LINKS) -> Any:
-    """Return the object of a name, None if there is none; links inside the file are followed.
+    """Return the object at a path, following links inside the file; None if there is none.
 
     Args:
         group: origin of a relative name.
-        name: with slashes.
+        name: path, with slashes.
         most_links: soft links that may follow each other.
 
     Raises:
-        SourceError: it is in another file, which is not opened.
+        SourceError: the object is in another file, which is not opened.
         ValueError: soft links lead in a circle.
     """
     import h5py
@@ -160,7 +160,7 @@ def _column(file: Any, name: str) -> Any:
     """Find a list of numbers.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: there is no column of this name.
     """
     column = _find(file, name)
     if getattr(column, "ndim", 0) != 1 or column.dtype.kind not in "biuf":

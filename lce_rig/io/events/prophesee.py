@@ -171,7 +171,7 @@ class PropheseeEvents(EventStream):
         """Read the header.
 
         Raises:
-            SourceError: it is no .raw file, or of another encoding.
+            SourceError: not a .raw file, or one in another encoding.
         """
         self._path = path
         self.notes: list[str] = []

@@ -36,7 +36,7 @@ class RawMessage(NamedTuple):
     Attributes:
         msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
         encoding: "ros1" or "cdr".
-        log_ns: when the recorder received it.
+        log_ns: time of receipt by the recorder.
     """
 
     topic: str
@@ -51,17 +51,17 @@ class BagFile:
 
     Attributes:
         path: the file or folder.
-        files: those of the bag that hold messages.
+        files: files of the bag that hold messages.
         topics: (message type, number of messages) by topic.
         damages: errors of files that cannot be opened, beside others that can.
-        end_ns: when the recorder received the last message.
+        end_ns: time of receipt of the last message.
     """
 
     def __init__(self, path: Path) -> None:
         """Read the list of topics.
 
         Raises:
-            SourceError: nothing can be read.
+            SourceError: the bag cannot be read.
         """
         self.path = path
         self.topics: dict[str, tuple[str, int]] = {}
@@ -81,7 +81,7 @@ class BagFile:
         """Yield the messages of some topics in the order the recorder received them.
 
         Raises:
-            SourceError: the bag is damaged; after everything before the damage.
+            SourceError: the bag is damaged; raised after all messages before the damage.
         """
         n_read = 0
         with self._readers() as readers:
@@ -134,7 +134,7 @@ class BagFile:
 def kind_of(path: Path) -> str:
     """Return the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder".
 
-    The suffix is in lower case, and that of the bag for a compressed one or one that was not closed.
+    The suffix is in lower case; for compressed or unclosed bags, it is that of the bag itself.
     """
     if not path.is_dir():
         name = path.name.lower()
@@ -183,7 +183,7 @@ def _plain(file: Path) -> Iterator[Path]:
 def _bound_rosbags() -> None:
     """Make rosbags unpack chunks, messages and files within the limits of `core.bounds`.
 
-    The tables of decompressors are replaced, as theirs unpack a chunk before its size is checked.
+    The tables of decompressors are replaced, as the original ones unpack a chunk without a size limit.
     """
     lz4 = import_module("lz4.frame")
     from rosbags.rosbag1 import reader as ros1

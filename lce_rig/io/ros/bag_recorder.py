@@ -48,7 +48,7 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
     """Encode an image as sensor_msgs/Image, mono8 or bgr8.
 
     Args:
-        image: the image; one without a timestamp gets 0, which readers take for none.
+        image: the image; one without a timestamp gets 0, which readers treat as none.
         frame_id: frame of the header.
         is_ros1: whether for ROS 1.
     """
@@ -70,7 +70,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryvie
     """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, if known, time.
 
     Args:
-        scan: the scan; one without a timestamp gets 0, which readers take for none.
+        scan: the scan; one without a timestamp gets 0, which readers treat as none.
         settings: the LiDAR's frame, and which firing its timestamps mark.
         is_ros1: whether for ROS 1.
     """
@@ -123,8 +123,9 @@ def _serialize(message: Any, msgtype: str, is_ros1: bool) -> memoryview:
 class BagRecorder(AbstractContextManager["BagRecorder"]):
     """A bag open for writing; a context manager.
 
-    Samples go to the disk a megabyte at a time and are not kept. A bag that was never closed, because the
-    program was killed or the disk is full, lacks its index: `rosbag reindex` or `mcap recover` restores it.
+    Samples are written a megabyte at a time and are not kept in memory. A bag that was never closed, because
+    the program was killed or the disk is full, lacks its index: `rosbag reindex` or `mcap recover` restores
+    it.
 
     Attributes:
         path: a ROS 1 bag if it ends in .bag, else the folder of a ROS 2 bag (mcap).
@@ -134,7 +135,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         """Create an empty bag.
 
         Raises:
-            SourceError: something is there already, or nothing can be written there.
+            SourceError: the path exists already, or cannot be written.
         """
         self.path = path
         self._rig = rig
@@ -150,7 +151,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         """Create recording.bag, or for ROS 2 recording/, in a new folder.
 
         Raises:
-            SourceError: the folder is there already, or cannot be made.
+            SourceError: the folder exists already, or cannot be created.
         """
         try:
             folder.mkdir(parents=True)
@@ -167,7 +168,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         Raises:
             SourceError: the disk is full, now or before; the rig lacks the sensor; or two sensors of the
                 profile share a topic and differ in kind.
-            ValueError: it has no timestamp at all.
+            ValueError: the sample has no timestamp at all.
         """
         if isinstance(sample, Events):
             channel = event_channel(self._rig, sample.sensor) or "events"

@@ -87,7 +87,7 @@ class PacketDecoder:
         """Decode a packet.
 
         Raises:
-            ValueError: its encoding is not supported.
+            ValueError: the encoding is not supported.
         """
         events, base_ns = NO_EVENTS, 0
         if packet.encoding == "evt3":
@@ -95,7 +95,7 @@ class PacketDecoder:
         elif packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
             events = self._compressed.decode(packet.words)
-            # The driver's time base has its own nanoseconds; the codec drops them, and so does this reader.
+            # The codec truncates the driver's time base to whole microseconds; so does this reader.
             base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
         elif packet.encoding != "trigger":
             raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
@@ -121,7 +121,7 @@ class BagEvents(EventStream):
         fitting = sorted(name for name, (kind, n) in topics.items() if kind in EVENT_TYPES and n > 0)
         if topic is None and len(fitting) != 1:
             fault = f"events on {len(fitting)} topics" if fitting else "no topic with events"
-            hint = f"{list_topics(topics)}. Say which topic holds the camera's events."
+            hint = f"{list_topics(topics)}. Name the topic of the camera's events."
             raise SourceError(f"{path}: {fault}", hint)
         self._topic = topic or fitting[0]
         kind, n_messages = topics.get(self._topic, ("", 0))

@@ -116,7 +116,8 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
         (H, W) grey or (H, W, 3) BGR.
 
     Raises:
-        ValueError: it is damaged, a depth image, of an unknown encoding, or its sizes contradict each other.
+        ValueError: the message is damaged, a depth image, of an unknown encoding, or its sizes are
+            contradictory.
     """
     if hasattr(message, "format"):
         encoding = str(message.format).lower()
@@ -271,14 +272,14 @@ _TIME_AT, _NAME_AT = 4, 12
 def decode_event_array(data: bytes, encoding: str) -> tuple[EventHead, EventColumns]:
     """Decode one dvs_msgs/EventArray without rosbags, which would create an object per event.
 
-    Its header's timestamp is device time, so that the host's is left open.
+    Its header's timestamp is device time; the host's is unknown.
 
     Args:
-        data: the message as it lies in the bag.
+        data: the serialised message.
         encoding: "ros1" or "cdr".
 
     Raises:
-        ValueError: it is damaged, or big-endian CDR.
+        ValueError: the message is damaged, or big-endian CDR.
     """
     if encoding != "ros1" and data[1:2] != b"\x01":
         raise ValueError("it is not little-endian CDR")

@@ -1,7 +1,7 @@
 """Sensors of a bag with timestamps of another clock, mapped by their times of receipt.
 
-The recorder notes on one clock when it received each message. A message is received after its data: a scan
-after its last firing, an image after its exposure.
+The recorder logs the time of receipt of each message on one clock. A message is received after its data: a
+scan after its last firing, an image after its exposure.
 """
 
 import struct
@@ -18,7 +18,7 @@ from lce_rig.io.ros.bag_file import BagFile
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import fit_clock
 
-# Difference of two sensors' delays above which their clocks differ, s: messages wait less in any pipeline.
+# Difference of two sensors' delays above which their clocks differ, s: longer than delays in any pipeline.
 _MAX_DELAY_S = 2.0
 # Messages read to find the delays, in total and per topic: raw images have megabytes.
 _N_PROBED, _N_OF_TOPIC = 500, 5
@@ -37,11 +37,11 @@ Stamps = NDArray[np.int64]
 def find_foreign(bag: BagFile, topics: Collection[str], *, has_host: bool) -> list[str]:
     """List the topics with timestamps of another clock than the rest of the bag.
 
-    Timestamps that are all as far from their receipt are those of one clock, as in a bag that was replayed
-    into another.
+    If all timestamps differ from their receipts by the same time, they are on one clock, as in a bag
+    re-recorded from another.
 
     Args:
-        bag: whose messages all have headers.
+        bag: bag in which all messages have headers.
         topics: topics of images and scans.
         has_host: whether other streams of the rig are on the recorder's clock.
     """
@@ -56,13 +56,13 @@ def fit_to_receipts(bag: BagFile, topic: str, *, is_sent_after: bool) -> ClockMo
     """Fit the recorder's clock to the timestamps of a topic.
 
     Args:
-        bag: that holds it.
+        bag: bag with the topic.
         topic: topic of images or scans.
         is_sent_after: whether messages are sent a period after the moment that their timestamp marks: scans
             marked by their first firing.
 
     Returns:
-        The model from the sensor's clock to the recorder's; None where receipts do not follow the timestamps.
+        The model from the sensor's clock to the recorder's; None if receipts do not follow the timestamps.
     """
     stamps, receipts = _read_times(bag, [topic])
     if topic not in stamps:

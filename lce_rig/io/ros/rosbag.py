@@ -43,7 +43,7 @@ class TopicDecoder:
     Args:
         target: the sensor of the topic.
         settings: that sensor's block of the profile.
-        clock: from the timestamps' clock to the recorder's; None if they are the same.
+        clock: model from the timestamps' clock to the recorder's; None if they are the same.
 
     Attributes:
         n_yielded: samples so far.
@@ -253,7 +253,7 @@ class BagRecording:
     def _fit_clocks(self) -> dict[str, ClockModel]:
         """Fit the clocks of sensors that differ from the others', by topic; add a note for each.
 
-        The profile's `expected_offset_s` comes first, and packets bring their arrivals.
+        Sensors with an `expected_offset_s` in the profile are skipped, as are packets.
         """
         topics = {
             topic: target

@@ -45,7 +45,8 @@ class Target:
     """A camera channel, or a LiDAR (channel None).
 
     Attributes:
-        has_events: whether the channel is of kind events: raw ones, or images that others made of them.
+        has_events: whether the channel is of kind events: raw events, or images reconstructed from them by
+            other programs.
     """
 
     sensor: str
@@ -83,8 +84,8 @@ def choose_topics(
         Sensor by topic: at least one camera channel and one LiDAR, or either one in a part of a recording.
 
     Raises:
-        SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
-            left; the hint lists the topics that are there.
+        SourceError: a requested topic is missing or of another type, or there are no images or point clouds;
+            the hint lists the topics of the bag.
     """
     targets, asked = _list_targets(rig, options)
     there, chosen = list_topics(topics), dict[str, Target]()
@@ -140,7 +141,7 @@ def choose_topics(
             take(target, topic, f", the only topic with {what}")
             continue
         fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}"
-        hint = f"{there}. Say which with --topic {target}=TOPIC, or set topic in the profile."
+        hint = f"{there}. Choose one with --topic {target}=TOPIC, or set topic in the profile."
         failures.append(SourceError(f"{path}: {fault} for {target}", hint))
     if failures and not (options.is_part and chosen):
         raise failures[0]
@@ -151,7 +152,7 @@ def _list_targets(rig: Rig, options: SourceOptions) -> tuple[dict[Target, str | 
     """List the rig's sensors with their topics from the profile, and the requested topics.
 
     Raises:
-        SourceError: a topic was asked for a sensor that the rig does not have.
+        SourceError: a topic is given for a sensor that the rig does not have.
     """
     targets: dict[Target, str | None] = {
         Target(name, channel, settings.kind == "events"): settings.topic
@@ -175,9 +176,9 @@ class SensorTopic:
     """One topic of a bag with a sensor's data.
 
     Attributes:
-        topic: its name.
+        topic: name of the topic.
         kind: "scans", "frames" or "events".
-        n_messages: how many there are.
+        n_messages: number of messages.
         rate_hz: from the receipt of the first to the bag's end; None for a single one.
         frame: frame_id of the first message's header, or "".
         size_px: (width, height) of images and event arrays; None if not stated.
@@ -224,7 +225,7 @@ def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic
         skipped: receives the topics that cannot be decoded, with the reason.
 
     Raises:
-        SourceError: it cannot be read, or holds no such topic.
+        SourceError: the bag cannot be read, or has no such topic.
     """
     bag = BagFile(path)
     types = {topic: kind for topic, (kind, n) in bag.topics.items() if n > 0}
@@ -245,7 +246,7 @@ def survey_bag(path: Path, skipped: list[str] | None = None) -> list[SensorTopic
             raise
     sensors, skipped = [], [] if skipped is None else skipped
     skipped += [
-        f"{topic}: skipped, {kind} is not read: record raw or compressed images"
+        f"{topic}: skipped, {kind} is not supported: record raw or compressed images"
         for topic, kind in types.items()
         if _VIDEO.search(kind)
     ]
@@ -277,7 +278,7 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
     """Describe a topic with n messages by its first one.
 
     Raises:
-        SourceError, ValueError: that is damaged, or no image or scan.
+        SourceError, ValueError: the message is damaged, or not an image or scan.
     """
     if message.msgtype in EVENT_TYPES:
         head = read_event_head(message)
@@ -316,7 +317,7 @@ def _without_computed(sensors: list[SensorTopic], skipped: list[str]) -> list[Se
 def _info_of(sensor: SensorTopic, infos: Collection[str]) -> str | None:
     """Return the camera_info topic of an image's topic, or None.
 
-    Drivers put it beside the image, also with the same beginning (left_camera_info for left_image), or below.
+    Drivers publish it beside the image, with an equal prefix (left_camera_info for left_image), or below it.
     """
     beside = sorted(info for info in infos if _namespace(info) == sensor.namespace)
     last = sensor.image_topic.rpartition("/")[2]

@@ -44,7 +44,7 @@ def draw_debug(
     mismatch: Refusal | None = None,
     events: Events | None = None,
 ) -> Picture:
-    """Draw the camera's image beside three views of the scan, with cause and action for a refused one.
+    """Draw the camera's image beside three views of the scan; if refused, with cause and action.
 
     Args:
         image: None if it could not be read.
@@ -53,11 +53,11 @@ def draw_debug(
         lidar_result: candidates, best first, or why the scan was refused.
         board: the board.
         intrinsics: the camera.
-        title: one line above.
+        title: one line above the drawing.
         chosen: index of the candidate used, which is drawn face on.
-        mismatch: why no candidate is the board in the image, if the sensors disagree; the best one is drawn
-            face on and in another colour.
-        events: those that an image was reconstructed from; the latest before it are drawn over it below.
+        mismatch: if the sensors disagree, why no candidate matches the board in the image; the best candidate
+            is drawn face on in another colour.
+        events: events that the image was reconstructed from; a pane below shows the latest over the image.
 
     Returns:
         (H, 1600, 3) uint8 BGR.

@@ -62,8 +62,8 @@ def draw_overlay(
         scan: points in frame lidar.
         intrinsics: the camera.
         T_cam_lidar: (4, 4) the extrinsics to judge.
-        lidar_board: its points are marked, and ring ends of a LiDAR; None for the scan only.
-        image_board: its outline is drawn, and corners of a camera; None for none.
+        lidar_board: board in the scan, to mark its points and ring ends; None for the scan only.
+        image_board: board in the image, to draw its outline and corners; None for none.
         board: the board, for its outline.
         limits_m: ends of the range scale; those of the scan if None.
 
@@ -328,7 +328,7 @@ def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
         check: result for two LiDARs.
 
     Returns:
-        The same as of that camera, and T_camera_first (4, 4).
+        The check for that camera, and T_camera_first (4, 4).
     """
     middles = [meeting.measured.pose.T_cam_board[:3, 3] for meeting in check.meetings.values()]
     T_view = optical_frame(np.array(middles).reshape(-1, 3))
@@ -347,7 +347,7 @@ def draw_cloud(scan: Scan, T_view: Array) -> Image:
 
     Args:
         scan: scan of the first LiDAR.
-        T_view: (4, 4) from its frame to the camera's.
+        T_view: (4, 4) transform from its frame to the camera's.
     """
     points = transform(T_view, scan.points[np.isfinite(scan.points).all(axis=1)])
     pixels, is_valid = _WINDOW.project(points)

@@ -92,7 +92,7 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
     ):
         raise SourceError(
             "there is no display for a window",
-            "Write a picture instead: `lce-rig view SESSION --output view.png`",
+            "Write an image instead: `lce-rig view SESSION --output view.png`",
         )
     o3d = _open3d()
     window = _opened(o3d.visualization.VisualizerWithKeyCallback(), is_visible=True)

@@ -151,7 +151,7 @@ _HEADERS = {
 
 
 class Feed:
-    """Holds only the newest state; a slow reader misses those in between. Requests go the other way."""
+    """Passes states to the page, and requests back. Only the newest state is kept."""
 
     def __init__(self) -> None:
         self._newest: tuple[int, float, LiveState] | None = None
@@ -194,7 +194,7 @@ class Viewer:
     """Sends the newest state to one open page as fast as the page can follow.
 
     The page answers each message once it is on the screen, and reports whether it is visible; only then are
-    images sent. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
+    images sent. It may also request to reject the last capture that it shows. Nothing else is read
     from it.
     """
 

@@ -30,13 +30,13 @@ def parse_address(text: str) -> tuple[str, int]:
     """Parse an address: "host:port", "host" or "port"; this computer alone and port 8765 by default.
 
     Raises:
-        UsageError: it is none of these.
+        UsageError: the text has another form.
     """
     host, colon, port = text.strip().partition(":")
     if not colon and host.isdecimal():
         host, port = "", host
     if re.search(r"[\s/\[\]]", host) or not re.fullmatch("[0-9]{0,5}", port) or int(port or 0) > 65535:
-        raise UsageError(f"{text!r} is no address for a page", _HINT)
+        raise UsageError(f"{text!r} is not an address for the page", _HINT)
     return host or LOOPBACK, int(port or DEFAULT_PORT)
 
 
@@ -102,12 +102,12 @@ class Preview:
 
     Attributes:
         urls: the links, the likeliest first; empty before `start`.
-        failure: that ended the page; "" for none. The collection continues without it.
+        failure: failure that ended the page; "" for none. The collection continues without it.
 
     Args:
         address: host name or IPv4 address to bind to; "0.0.0.0" for all networks.
-        port: 0 for any free one.
-        token: that a browser must bring; None draws one.
+        port: port number; 0 for any free one.
+        token: token that a browser must send; None for a random one.
     """
 
     def __init__(self, address: str = LOOPBACK, port: int = DEFAULT_PORT, token: str | None = None) -> None:

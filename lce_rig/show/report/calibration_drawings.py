@@ -33,7 +33,7 @@ class Evidence:
         plane_m: (N,) signed distance from the camera's board plane, positive behind it.
         ring: (N,) of each point.
         range_m: (C,) distance of each capture's board from the LiDAR.
-        corners_px: (M, 2) as measured.
+        corners_px: (M, 2) measured corners.
         corner_residuals_px: (M, 2) measured less predicted from the board's best pose in its image.
     """
 

@@ -49,10 +49,10 @@ def report_page(
     """Write the report of a result as one HTML file: the same result gives the same bytes.
 
     Args:
-        session: whose result it is.
+        session: session of the result.
         file: the result.
         overlays: the folder of overlays beside the report, which shows them once they are drawn.
-        thumbnails: thumbnails of the session, if some are known; the page is the same without.
+        thumbnails: available thumbnails of the session; the page is the same without them.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
     origin, folder = file.provenance, session.path.resolve().name
@@ -226,7 +226,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
         return [*steps, f"Then run `lce-rig calibrate {shlex.quote(folder)}` again.{earlier}"]
     look_for = "ring ends must lie on the board's outline on all sides."
     if c.is_of_lidars:
-        look_for = "both clouds must show the board in one place."
+        look_for = "both point clouds must show the board at the same place."
     elif c.is_of_cameras:
         look_for = f"corners by {c.lidar} must lie on those of the pattern."
     return [
@@ -249,7 +249,7 @@ def picture_of(
     """Draw a capture's image with the board's outline; raw events if the capture has no image.
 
     Args:
-        capture: with the data.
+        capture: capture with the data.
         c: the result; its channels are tried in their order.
         board: board of the outline.
         lens: intrinsics of the camera.
@@ -282,7 +282,7 @@ def data_uri(thumbnail: Thumbnail, outline: Array) -> str:
 
     Args:
         thumbnail: thumbnail of the image, shown unchanged.
-        outline: (N, 2) px of the image; points that are not finite are left out.
+        outline: (N, 2) px of the image; points that are not finite are skipped.
 
     Returns:
         A JPEG as a data URI.
@@ -303,7 +303,7 @@ def worst_first(planes_m: Sequence[float], edges_m: Sequence[float]) -> list[tup
     """Order captures by their residuals, the largest first.
 
     Returns:
-        The index of each, and how many times the median its planes or edges lie apart.
+        The index of each, and the ratio of its plane or edge residuals to the median.
     """
     ratios = np.zeros(len(planes_m))
     for values in (np.nan_to_num(np.array(planes_m)), np.nan_to_num(np.array(edges_m))):

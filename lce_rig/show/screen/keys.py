@@ -32,7 +32,7 @@ class Controls:
     Attributes:
         is_interactive: whether keys can be pressed at all.
         signal: number of the signal received, or None.
-        wants_code: whether the page's QR code is wanted on the screen.
+        wants_code: whether to show the page's QR code on the screen.
     """
 
     is_interactive: bool

@@ -174,7 +174,7 @@ class PlainView:
         for text in state.log[len(state.log) - n_new :]:
             _print(text)
         self._n_logged = state.n_logged
-        # Once for each capture: the figures change as more is learned, too.
+        # Only once per capture, though the figures also change in between.
         if state.goes_on and state.n_captures != self._n_explained:
             self._n_explained = state.n_captures
             _print(f"{_clock(state)} {state.goes_on}")

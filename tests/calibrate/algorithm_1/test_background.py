@@ -1,4 +1,4 @@
-"""Ring ends before a background: by how much the board ends sooner there is found and made good."""
+"""Ring ends before a background: the shift of the board's edge is estimated and compensated."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m
 
 
 def sooner(capture, by_m, echo, behind_m):
-    """Move ring ends of one capture inwards by (M,), and tell what is behind them."""
+    """Move ring ends of one capture inwards by (M,), and set their background."""
     lidar = capture.lidar
     axis = lidar.T_lidar_board[:3, :2]
     local = (lidar.edge_points - lidar.T_lidar_board[:3, 3]) @ axis
@@ -26,7 +26,7 @@ def sooner(capture, by_m, echo, behind_m):
 
 
 def held(capture, is_behind, echo=0.0):
-    """Let a person stand close behind some ring ends: the board ends 8 mm sooner there, and more by echo."""
+    """Place a person close behind some ring ends: the board ends 8 mm earlier there, and more by the echo."""
     share = np.where(is_behind, echo, 0.0)
     return sooner(capture, 0.008 * is_behind + 0.02 * share, share, np.where(is_behind, 0.2, np.inf))
 
@@ -106,7 +106,7 @@ def test_residuals_use_shifted_ring_ends():
 
 
 def test_background_person_behind_few_boards_is_ignored():
-    # One capture says nothing of how captures scatter, and two hardly tell two effects from chance.
+    # One capture has no scatter, and two hardly distinguish two effects from chance.
     rng = np.random.default_rng(2)
     for n_held in (1, 2, 3):
         boards = enumerate(simulate(6, 9))

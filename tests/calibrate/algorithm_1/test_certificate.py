@@ -1,4 +1,4 @@
-"""The certificate: given to every global minimum, never to anything else."""
+"""The certificate: every global minimum has it, other solutions never."""
 
 import numpy as np
 

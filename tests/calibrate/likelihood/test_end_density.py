@@ -1,4 +1,4 @@
-"""The density of ring ends: normalised, differentiated rightly, and as informative as samples of it say."""
+"""The density of ring ends: norm, derivatives, and information compared with samples."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The joint estimate against simulated truth: errors, claims, constants, several cameras, hard captures."""
+"""The joint estimate compared with simulated truth: errors, constants, several cameras, outliers."""
 
 from dataclasses import replace
 
@@ -77,7 +77,7 @@ def test_refine_large_range_offset_is_found():
 
 
 def raised(capture, metres_per_rad):
-    """Displace a LiDAR's points as a driver does that knows nothing of the lasers' heights."""
+    """Displace a LiDAR's points like a driver that ignores the lasers' heights."""
     lidar = capture.lidar
 
     def move(points):
@@ -224,7 +224,7 @@ def test_refine_bright_wall_is_modelled():
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
     blind = [replace(o, surface=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
     unaware = maximise_likelihood([blind], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
-    # Shifts of single captures take its place, which say less.
+    # Shifts of single captures replace it, with less information.
     assert unaware.levels.own_shift_m > 2 * joint.levels.own_shift_m
     assert np.trace(unaware.cov[0]) > 1.1 * np.trace(joint.cov[0])
 

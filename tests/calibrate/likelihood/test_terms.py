@@ -1,4 +1,4 @@
-"""Residuals of the joint likelihood: derivatives, sums and evidence against the same computed plainly."""
+"""Residuals of the joint likelihood: derivatives, sums and evidence compared with a plain computation."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def without_errors(scans, T_lidar_board):
 
 
 def off(state, name, index, value):
-    """Give one constant error a value."""
+    """Set one constant error."""
     z = state.z.copy()
     z[state.layout.z[name]][index] = value
     return replace(state, z=z)
@@ -115,7 +115,7 @@ def test_terms_lens_shift_matches_derivative(observations, scans, T_lidar_board,
 
 @pytest.mark.parametrize("error", [1, 2])
 def test_terms_laser_angles_match_derivative(scans, T_lidar_board, error):
-    """One laser points elsewhere by 0.05 mrad: as if its rays were turned."""
+    """One laser's direction is off by 0.05 mrad: its rays rotate."""
     plain_state, ring = without_errors(scans, T_lidar_board), 3
     state = off(plain_state, ("range", "azimuth", "elevation")[error], ring, 5e-5)
     is_mine = scans.ring == ring

@@ -1,4 +1,4 @@
-"""Where the board is sent, when it is enough, and what is refused."""
+"""The next placement, the end of the collection, and refused placements."""
 
 import re
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_guide_asks_for_named_distances(profile, camera):
     assert max(NEAREST_M, limits.min_distance_m) <= near_m < 1.3
     assert near_m < far_m <= limits.max_distance_m
     guide = (Path(__file__).parents[3] / "docs" / "collect.md").read_text()
-    assert f"distance from {NEAREST_M:g} m" in guide
+    assert f"Distances from {NEAREST_M:g} m" in guide
     assert re.search(rf"{far_m:.1f} m [^.]*`{profile}`", guide)
 
 
@@ -158,7 +158,7 @@ def test_planner_without_placements_refuses_with_reason(planner):
 
 
 def crowded():
-    """Captures that crowd about one place, and a board among them that tells little."""
+    """Captures close to one place, and a board among them with little information."""
     bold = Planner(view(), 0.001, 0.05, n_places=100)
     near = bold.guide(NONE).T_cam_board
     crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-6, 7)])

@@ -1,4 +1,4 @@
-"""Instructions for a person who stands behind the board and faces the rig."""
+"""Instructions for the person behind the board, facing the rig."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a rig on the wire has sent, held against what a session keeps of it."""
+"""Samples sent by a rig on the wire, compared with those stored in the session."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def check_whole(session):
 
 
 def check_sent(capture, sent):
-    """Make sure that a capture is bit for bit what was sent of one placement, and give that."""
+    """Return the placement whose sent samples equal those of a capture bit for bit."""
     scan, image = capture.scan("lidar"), capture.image("cam", "frames")
     shown = [k for k, pictures in enumerate(sent.pictures) if (pictures == image.pixels).all((1, 2)).any()]
     seen = [k for k, scans in enumerate(sent.scans) if any(_are_alike(scan, each) for each in scans)]
@@ -74,7 +74,7 @@ def apart_s(capture, camera="cam"):
 
 
 def captured_names(said):
-    """List the captures that were said to be safe."""
+    """List the captures reported as saved."""
     return re.findall(r"captured (\d{6}) \(", said)
 
 

@@ -37,7 +37,7 @@ def test_collect_still_boards_are_captured(tmp_path):
         shown = []
         for capture in session.captures:
             capture.check()
-            # A computer that is busy may be late for a placement, and see it when it comes again.
+            # A busy computer may miss a placement, and detect it when it is repeated.
             stamp_ns = capture.scan("lidar").stamp_ns
             (k,) = (k for k, stamps in enumerate(show.stamps) if stamp_ns in stamps)
             shown.append(k)
@@ -120,7 +120,7 @@ def test_pending_capture_can_be_taken_back(tmp_path, monkeypatch):
         add, is_asked = session.add_capture, threading.Event()
 
         def add_slowly(*given):
-            """Write as a disk does that is busy until somebody has pressed the key."""
+            """Write like a disk that is busy until the key is pressed."""
             is_asked.wait(60.0)
             return add(*given)
 

@@ -1,4 +1,4 @@
-"""When live boards are captured, by detections that come one by one."""
+"""Conditions of live captures, with detections arriving one by one."""
 
 from dataclasses import replace
 from functools import cache
@@ -38,7 +38,7 @@ def present():
 def test_gate_held_board_is_captured_once():
     gate = StillBoards(rig(), HOLD_S)
     taken = [step for step in range(40) if gate.take(detection(step))]
-    # Half a second tells that it stands still, the hold comes after that.
+    # Half a second shows that it stands still; the hold follows.
     assert taken == [12]
 
 
@@ -64,7 +64,7 @@ def test_gate_narration_counts_down_then_continues():
     held = [each.hold_s for each in said if each.phase == "holding"]
     assert held == sorted(held, reverse=True) and len(held) == 7
     assert np.isclose(held[0], HOLD_S) and held[-1] < 0.1
-    # Captured, the board is wanted elsewhere, although it still stands.
+    # After the capture, the next placement is shown although the board still stands.
     assert {each.phase for each in said[13:]} == {"moving"}
     assert all(each.headline not in ("", "hold still") for each in said[13:])
 

@@ -1,4 +1,4 @@
-"""Guidance over a session: what is wanted next, what adds nothing, what is learned on the way."""
+"""Guidance during a session: next placement, useless placements, learning from captures."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_guide_two_lidars_counts_placements():
     assert not guide.is_enough
 
 
-def test_a_capture_that_is_taken_back_is_forgotten(guide):
+def test_rejected_capture_frees_its_placement(guide):
     for k in range(3):
         guide.plan(None, float(k))
         last = guide.wanted
@@ -180,7 +180,7 @@ class Followed:
 
 
 def follow_guide(rig, n_wanted, person=None, can_be_held=lambda _T_cam_board: True):
-    """Follow a rig's first guide until there are as many captures as wanted, or none for ten minutes."""
+    """Follow a rig's first guide until the requested number of captures, or none for ten minutes."""
     guide = make_guides(rig)[0]
     view = SensorPlace.nominal(rig, guide.key[0], guide.lidar)
     person, rng, walk = person or Person(), np.random.default_rng(0), Followed()

@@ -1,4 +1,4 @@
-"""The simulated person goes where the room lets them."""
+"""The simulated person avoids obstacles of the room."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A collection on sensors that send over UDP and pipes: what it holds, how it ends, and its recordings."""
+"""Collection from sensors that send over UDP and pipes: captures, end, and recordings."""
 
 import random
 import signal
@@ -102,7 +102,7 @@ def test_collect_ended_camera_is_named(wire, tmp_path):
 
 
 @pytest.mark.long
-def test_collect_captures_hold_what_was_sent(wire, reel, tmp_path):
+def test_collect_stores_the_sent_samples(wire, reel, tmp_path):
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0", "--captures", "2") as collecting:
         assert collecting.wait() == 0

@@ -1,4 +1,4 @@
-"""Sensors, clocks and disks that fail while `lce-rig collect` runs: it goes on where it can."""
+"""Sensors, clocks and disks that fail during `lce-rig collect`, which continues if possible."""
 
 import os
 import resource
@@ -162,5 +162,5 @@ def test_guidance_continues_during_slow_write(wire, tmp_path, monkeypatch):
     assert report.ending == "frames" and report.latencies_s[0] > 2.0
     during_s = [at_s for at_s in states_s if begun_s[0] < at_s < begun_s[0] + 2.0]
     assert len(during_s) >= 4
-    # Boards that were held still meanwhile are more than were wanted.
+    # Meanwhile more boards were held still than requested.
     assert len(check_whole(tmp_path / "session")) == 1

@@ -23,7 +23,7 @@ STREAM = """<node name="{number}" path="/mainloop/Recorder/outInfo/{number}/">
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
-    """A frame as it is written; `style` says which program's fields it has."""
+    """A frame as it is written; `style` selects the fields by program."""
 
     start_us: int
     exposure_us: int

@@ -65,7 +65,7 @@ def test_dv_processings_own_frames_are_read(tmp_path):
         assert np.array_equal(grey.pixels, GREY) and np.array_equal(colour.pixels, COLOUR)
 
 
-def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path):
+def test_damaged_frame_is_skipped_and_counted(tmp_path):
     frames = [RawFrame(START_US + 40_000 * k, 8000, GREY) for k in range(3)]
     path = write_davis(tmp_path / "a.aedat4", [], frames)
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Events come back event for event as cameras encode them; in bags, lost and broken packets are counted."""
+"""Round trips of events in the cameras' encodings; lost and broken packets in bags are counted."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_codecs_sensor_clock_wraps_seamlessly():
     assert columns_listed(WordDecoder(EVT3).decode(np.frombuffer(encoders.evt3(truth), "<u2"))) == truth
 
 
-def test_a_time_word_that_steps_back_a_little_is_no_wrap():
+def test_small_step_back_of_time_is_not_a_wrap():
     words = [8 << 12 | 50, 6 << 12, 9, 2 << 12 | 1, 8 << 12 | 49, 2 << 12 | 2, 8 << 12 | 51, 2 << 12 | 3]
     events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
     assert (events.t_ns // 4_096_000).tolist() == [50, 49, 51]
@@ -85,7 +85,7 @@ def test_packets_of_every_encoding_come_back(encoding, is_ros1, seed, n):
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])
-def test_event_arrays_are_what_ros_itself_reads(is_ros1):
+def test_event_arrays_are_read_by_ros(is_ros1):
     store = typestore(is_ros1)
     events = random_events(20, 4, start_us=1_700_000_000_000_000)
     data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr")

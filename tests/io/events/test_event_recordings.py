@@ -43,7 +43,7 @@ def test_aedat4_equals_vendor_reader(folder, name):
         ("evt3_pedestrians.raw", 5000, 45_210_000, [3_415_152, 1_425_333, 2_894]),
     ],
 )
-def test_recorded_events_keep_sums(folder, name, n, duration_ns, sums):
+def test_decode_recorded_events_matches_known_sums(folder, name, n, duration_ns, sums):
     t_ns, *others = columns(folder / name)
     assert (len(t_ns), np.ptp(t_ns)) == (n, duration_ns)
     assert [int(column.sum(dtype=np.int64)) for column in others] == sums

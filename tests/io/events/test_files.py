@@ -105,7 +105,7 @@ def test_events_of_another_camera_are_refused(tmp_path, name):
         list(open_events(tmp_path / name, sensor="davis", resolution=(240, 180)))
 
 
-def test_what_dv_processing_writes_is_read(tmp_path):
+def test_files_of_dv_processing_are_read(tmp_path):
     dv = pytest.importorskip("dv_processing")
     few = EVENTS.select(slice(0, 3000))
     store = dv.EventStore()

@@ -1,4 +1,4 @@
-"""Order, clocks and windows of recordings, told apart by small streams of known content."""
+"""Order, clocks and windows of recordings, with small streams of known content."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ class ListedStream(EventStream):
 
 
 def columns(t_us):
-    """Events at given times; the column says how many came before."""
+    """Events at given times; the column is the number of earlier ones."""
     n = len(t_us)
     x = (np.arange(n) % 346).astype(np.uint16)
     return EventColumns(np.asarray(t_us, np.int64) * 1000, x, np.zeros(n, np.uint16), np.ones(n, bool))

@@ -133,7 +133,7 @@ def test_a_picture_reads_back_unchanged(tmp_path):
     assert np.array_equal(cv2.imread(str(write_picture(tmp_path / "overlays" / "a.png", drawn))), drawn)
 
 
-def test_a_picture_that_cannot_be_written_names_the_file(tmp_path):
+def test_unwritable_image_error_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SessionError, match=r"file.a\.png"):
         write_picture(tmp_path / "file" / "a.png", np.zeros((4, 4, 3), np.uint8))

@@ -145,7 +145,7 @@ class Page(Line):
         )
 
     def evaluate(self, expression):
-        """Give the value of an expression, as if it followed from a tap."""
+        """Return the value of an expression, evaluated as if after a tap."""
         answer = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True, userGesture=True
         )
@@ -158,11 +158,11 @@ class Page(Line):
         return f"not true: {expression}; {where}; loaded {self.requested}; {self.complaints}"
 
     def text(self, element):
-        """Give the text of the element with this id."""
+        """Return the text of the element with this id."""
         return str(self.evaluate(f"document.getElementById({element!r})?.innerText ?? ''"))
 
     def each(self, selector, name="id"):
-        """Give a property of every element that a selector finds."""
+        """Return a property of every element that a selector matches."""
         found = f"[...document.querySelectorAll({selector!r})].map((each) => each[{name!r}])"
         return [str(value) for value in self.evaluate(found)]
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.realtime
 FILES = ("", "page.css", "page.js", "stage.js", "live", "nothing-here")
 
 
-def test_every_page_has_a_token_of_its_own():
+def test_every_page_has_its_own_token():
     with Preview("127.0.0.1", 0) as first, Preview("0.0.0.0", 0) as second:
         tokens = [preview.urls[0].partition("?token=")[2] for preview in (first, second)]
         assert all(re.fullmatch(r"[A-Za-z0-9_-]{12}", token) for token in tokens)

@@ -145,7 +145,7 @@ def test_pages_have_the_last_state_when_the_collection_ends():
     preview.close()
 
 
-def test_closing_does_not_wait_for_pages_whose_line_is_full():
+def test_closing_does_not_wait_for_stuck_pages():
     preview = Preview(port=0)
     query = preview.start().partition("?")[2]
     port = port_of(preview)

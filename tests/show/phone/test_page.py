@@ -60,7 +60,7 @@ def test_page_shows_complete_state(preview, browser, width, height):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_outlines_lie_where_the_boards_are_in_the_picture(preview, browser, width, height):
+def test_outlines_agree_with_boards_in_the_image(preview, browser, width, height):
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, "document.querySelector('#wanted .ink') !== null")
     for is_mirrored in (True, False):

@@ -16,7 +16,7 @@ from lce_rig.show.phone.pages import MAX_WIDTH_PX, encode_picture
         ((1, 5000), (1, 833)),
     ],
 )
-def test_pictures_are_made_small_enough_for_a_phone(shape, size):
+def test_images_are_reduced_for_a_phone(shape, size):
     pixels = np.zeros(shape, np.uint8)
     pixels[: shape[0] // 2] = 200
     decoded = cv2.imdecode(np.frombuffer(encode_picture(pixels), np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -35,7 +35,7 @@ class Watcher:
         )
 
     def receive(self, timeout_s=60.0):
-        """Give the next message: a document, bytes, or the number with which the connection was closed."""
+        """Return the next message: a document, bytes, or the code of the closed connection."""
         message = self._run(self.socket.receive(timeout_s))
         if message.type is aiohttp.WSMsgType.TEXT:
             return json.loads(message.data)

@@ -38,7 +38,7 @@ def test_every_capture_s_marks_lead_to_its_overlay(one, one_page):
         assert f'src="overlays/{residual.capture}.png"' in one_page
 
 
-def test_points_on_the_board_lie_where_residuals_say(one):
+def test_drawn_points_agree_with_residuals(one):
     board, lens = RLFS.board.to_board(), RLFS.cameras["cam"].to_intrinsics()
     evidence = gather(one, board, lens)
     for k, residual in enumerate(one.residuals):

@@ -26,7 +26,7 @@ def test_a_picture_is_small_and_of_its_image_s_shape(shape):
     assert width / height == pytest.approx(shape[1] / shape[0], rel=0.05)
 
 
-def test_the_outline_lies_where_the_board_is():
+def test_outline_agrees_with_the_board():
     square = np.array([[400.0, 200.0], [800.0, 200.0], [800.0, 500.0], [400.0, 500.0]])
     drawn = decoded(data_uri(reduced(np.zeros((720, 1280, 3), np.uint8)), square)).astype(int)
     v, u = np.nonzero(drawn.sum(axis=2) > 150)
