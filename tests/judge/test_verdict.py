@@ -170,7 +170,7 @@ def test_nominal_inverted_as_a_matrix_is_corrected(estimate, verdict_of):
     assert len(reasons[0].figures["enter_quaternion_wxyz"]) == 4
 
 
-def test_many_captures_with_disagreeing_sensors_lower_the_verdict(estimate, verdict_of):
+def test_many_disagreeing_captures_lower_the_verdict(estimate, verdict_of):
     refused = {f"x{k}": Refusal("pair.no_candidate") for k in range(10)}
     assert verdict_of(replace(estimate, refused=refused))[0] == "marginal"
     refused |= {f"y{k}": Refusal("calibrate.outlier") for k in range(20)}
