@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core.calibration import MOTIONS, ResultFile
+from lce_rig.core.data import Events
 from lce_rig.core.geometry import difference, exp_so3, perturb, pose, transform
-from lce_rig.pipeline.scene_calibration import View, calibrate_pair
+from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.pipeline.scene_calibration import View, calibrate_pair, calibrate_scene
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.rig import NominalExtrinsic, load_rig
 from lce_rig.scene.rig_motion import estimate_motion
@@ -167,12 +169,18 @@ def event_drive():
     return compute_once("event_drive", drive_by_events)
 
 
-def calibrated_by_events(profile, truth, views):
+def with_nominal(profile, truth):
+    """Enter a nominal pose 5 cm and 1 deg off."""
     off = perturb(truth, np.array([0.05, -0.04, 0.06, 0.012, -0.01, 0.014]))
     nominal = NominalExtrinsic(
         camera="davis", lidar="lidar", matrix=off[:3, :3].tolist(), translation_m=off[:3, 3].tolist()
     )
-    return calibrate_pair(profile, nominal, views)
+    return profile.model_copy(update={"nominal_extrinsics": (nominal,)})
+
+
+def calibrated_by_events(profile, truth, views):
+    rig = with_nominal(profile, truth)
+    return calibrate_pair(rig, rig.nominal_extrinsics[0], views)
 
 
 def test_scene_calibration_by_events_covers_truth(event_drive):
@@ -189,3 +197,25 @@ def test_scene_calibration_by_events_needs_motion(event_drive):
     standing = [replace(view, previous={"lidar": view.scans[0]}) for view in views[:2]]
     shortage, _ = calibrated_by_events(profile, truth, standing)
     assert shortage.code == "scene_calibration.events_of_standing_rig" and "cannot tell" in shortage.text
+
+
+def later(sample, by_ns):
+    """Move a scan or events to a later time."""
+    if isinstance(sample, Events):
+        return replace(sample, t_ns=sample.t_ns + by_ns)
+    return replace(sample, stamp_ns=sample.stamp_ns + by_ns)
+
+
+def test_scene_calibration_stores_events_of_bag(event_drive, tmp_path):
+    profile, truth, views = event_drive
+    rig = with_nominal(profile, truth)
+    with BagRecorder(tmp_path / "drive.bag", rig) as bag:
+        for k, view in enumerate(views):
+            for sample in (view.previous["lidar"], *view.scans, view.events[0].events):
+                bag.write(later(sample, k * 10**9))
+    found = calibrate_scene([tmp_path / "drive.bag"], tmp_path / "out", rig=rig)
+    again = calibrate_scene([tmp_path / "out"], "")
+    for (c,) in (found.result.pairs, again.result.pairs):
+        tangent = difference(c.T_cam_lidar, truth)
+        assert len(c.captures_used) == len(views)
+        assert tangent @ np.linalg.solve(c.cov, tangent) < 16.81
