@@ -77,6 +77,8 @@ _FREED: Mapping[Cause, Mapping[str, Any]] = {
 }
 _OF_CAMERA: tuple[Cause, ...] = ("focus_drift", "two_boards")
 ALL: tuple[Cause, ...] = (*_FREED, *_OF_CAMERA, *MOUNTINGS)
+# Causes that the likelihood cannot settle under; their probabilities are comparable with each other's only.
+_UNSETTLED: tuple[Cause, ...] = ("drift", *_OF_CAMERA)
 # Changes of the extrinsics in (1). A focal length that grows by a fraction shows boards nearer by the same
 # fraction of their depth: a translation along the camera's axis.
 _OF_POSES: tuple[Cause, ...] = (*MOUNTINGS, "focus_drift")
@@ -429,9 +431,8 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         # other.
         alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
         tried += [r for r in rows if r.cause in alike and r.log10_chance < _LIKELY * rows[0].log10_chance]
-        if rows[0].cause != "drift":
-            # A drift is not settled, and its probability is not that of the others.
-            tried = [row for row in tried if row.cause != "drift"]
+        if rows[0].cause not in _UNSETTLED:
+            tried = [row for row in tried if row.cause not in _UNSETTLED]
         tried += [near for row in tried if row.cause == "moved" for near in table.moves_beside(row)]
         once = {(row.cause, row.explanation.cut): row for row in tried}
         found = [_assume(hypothesis, noisy, row) for row in once.values()]
@@ -451,7 +452,7 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
     if row.cause in _FREED:
         after = now.under(priors=replace(now.priors, **_FREED[row.cause]))
         change = difference(after.T_in_use, now.T_in_use)
-    elif row.cause in ("drift", *_OF_CAMERA):
+    elif row.cause in _UNSETTLED:
         # The likelihood has no such unknown: use its expansion and the noise of single captures.
         unit = Table(now, frozenset()).unit_without(row)
         chance = row.log10_chance / unit if unit < _MOVING**2 else 0.0
