@@ -13,7 +13,7 @@ Channels of one camera, frames and events, share pixels and lens, not their time
 of extrinsics; two are compared by Algorithm 1, as a camera has one pose.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.association import find_association_error, is_of_all
 from lce_rig.calibrate.consensus import Consensus, find_consensus
-from lce_rig.calibrate.findings import FEW_AGREE, UNDETERMINED
+from lce_rig.calibrate.findings import FEW_AGREE, MIRRORED, UNDETERMINED
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.motion.board_motion import sample_poses
@@ -61,12 +61,15 @@ def estimate_extrinsics(
         NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
     """
     begin(progress, "intrinsics and board")
-    candidates, settings = _with_session_lens(candidates, board, settings)
-    agreed, noise_px, errors = _agree(candidates, board)
+    fitted, of_lens = _with_session_lens(candidates, board, settings)
+    agreed, noise_px, errors = _agree(fitted, board)
+    if mirrored := _mirrored(errors):
+        fitted, of_lens = _with_session_lens(candidates, board, settings, mirrored)
+        agreed, noise_px, errors = _agree(fitted, board)
     try:
-        estimate = _estimate(candidates, agreed, noise_px, board, settings, clocks, progress)
+        estimate = _estimate(fitted, agreed, noise_px, board, of_lens, clocks, progress)
     except NotEnoughDataError as error:
-        raise _before_geometry(error, candidates, agreed) from error
+        raise _before_geometry(error, fitted, agreed) from error
     return replace(estimate, association=errors)
 
 
@@ -165,13 +168,25 @@ def estimate_observations(
     return by_likelihood(start, joint, board, settings.lens)
 
 
+def _mirrored(errors: Sequence[Finding]) -> set[str]:
+    """List the captures whose images are mirrored; their corners do not fit the lens."""
+    found = (each.figures["captures"] for each in errors if each.code == MIRRORED.code)
+    return {str(name) for captures in found if isinstance(captures, tuple) for name in captures}
+
+
 def _with_session_lens(
-    candidates: Mapping[str, Sequence[Observation]], board: Board, settings: EstimateSettings
+    candidates: Mapping[str, Sequence[Observation]],
+    board: Board,
+    settings: EstimateSettings,
+    skipped: Collection[str] = (),
 ) -> tuple[Mapping[str, Sequence[Observation]], EstimateSettings]:
-    """Fit the session's lens, unless it is exact or known, and the boards' poses with it."""
+    """Fit the lens to the images, but for skipped captures, unless it is exact or known; refit all poses."""
     if settings.tolerances is None or settings.tolerances.lens.is_exact:
         return candidates, settings
-    images = {name: [o.image for o in observations] for name, observations in candidates.items()}
+    images = {
+        name: [o.image for o in observations if o.capture not in skipped]
+        for name, observations in candidates.items()
+    }
     lens = settings.lens or fit_session_lens(images, board, settings.tolerances.lens)
     refitted = {name: lens.refit(observations) for name, observations in candidates.items()}
     return refitted, replace(settings, lens=lens)

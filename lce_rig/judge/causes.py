@@ -109,8 +109,10 @@ def cause_findings(
         return [reason, *(replace(each, severity="note") for each in told if each is not reason)]
     if selected or estimate.joint is None:
         return told
-    ratio = estimate.joint[0].levels.largest_of_images
-    return [SCATTERED(ratio=ratio)] if ratio > SCATTER else []
+    levels = estimate.joint[0].levels
+    if levels.of_ranges > max(levels.largest_of_images, SCATTER):
+        return [SCATTERED(lidar, action="ranges", ratio=levels.of_ranges)]
+    return [SCATTERED(ratio=levels.largest_of_images)] if levels.largest_of_images > SCATTER else []
 
 
 def is_explained(selected: Sequence[Selected]) -> bool:
@@ -218,10 +220,10 @@ def _finding(
         return LASER_ANGLES(lidar, angle=cause.removesuffix("s"), rms_deg=rms_deg, **figures)
     if cause == "lens":
         return LENS(camera, **figures)
-    share = float(selected.gain.value[0])
     if cause == "two_boards":
-        return TWO_BOARDS(capture=after.captures[selected.gain.explanation.cut], share=share, **figures)
-    return FOCUS_DRIFT(camera, share=share, **figures)
+        share, cut = float(selected.gain.value[0]), selected.gain.explanation.cut
+        return TWO_BOARDS(capture=after.captures[cut], share=share, **figures)
+    return FOCUS_DRIFT(camera, share=-float(selected.gain.value[2]), **figures)
 
 
 def _of_mounting(

@@ -75,29 +75,35 @@ _FREED: Mapping[Cause, Mapping[str, Any]] = {
     "azimuths": {"azimuth_rad": 0.1, "known": None},
     "elevations": {"elevation_rad": 0.1, "known": None},
 }
-_OF_SQUARES: tuple[Cause, ...] = ("focus_drift", "two_boards")
-ALL: tuple[Cause, ...] = (*_FREED, *_OF_SQUARES, *MOUNTINGS)
+_OF_CAMERA: tuple[Cause, ...] = ("focus_drift", "two_boards")
+ALL: tuple[Cause, ...] = (*_FREED, *_OF_CAMERA, *MOUNTINGS)
+# Causes that the likelihood cannot settle under; their probabilities are comparable with each other's only.
+_UNSETTLED: tuple[Cause, ...] = ("drift", *_OF_CAMERA)
+# Changes of the extrinsics in (1). A focal length that grows by a fraction shows boards nearer by the same
+# fraction of their depth: a translation along the camera's axis.
+_OF_POSES: tuple[Cause, ...] = (*MOUNTINGS, "focus_drift")
 # Standard deviation of other unknowns: changes of the extrinsics, m and rad, and of the scale.
 _ANY = 1.0
 # Handicap of the rarer of two errors that only the plate's size separates, log10 of the probability: ranges
 # too long by a fraction look like squares larger than the profile's. On rlfs02, ranges of 2 % prefer the
 # right cause by 9, squares of 3 % the wrong one by 4.
 _RARER: Mapping[Cause, float] = {"range_scale": 8.0}
-_ALIKE: Sequence[Sequence[Cause]] = (MOUNTINGS, ("squares", "range_scale"), _OF_SQUARES)
+_ALIKE: Sequence[Sequence[Cause]] = ((*MOUNTINGS, *_OF_CAMERA), ("squares", "range_scale"))
 # Similar causes are settled, too, from this fraction of the best one's log10 of the probability.
 _LIKELY = 0.2
 SCATTER = 4.0
-"""Limit of the images' noise, in usual levels, above which no constant error explains the captures.
+"""Limit of the noise of images and of ranges, in usual levels, above which nothing explains the captures.
 
 It is two standard deviations of the prior of these levels."""
-# The same for changes of the mounting. Errors of boards that moved have long tails: setting any part of them
-# aside improves the fit of the rest. Each channel of rles01 and rles02 alone scatters 3 to 11 times as usual
-# and seems to have moved, both together 2.5 times.
+# The same of images for changes of the mounting. Errors of boards that moved have long tails: setting any
+# part of them aside improves the fit of the rest. Each channel of rles01 and rles02 alone scatters 3 to 11
+# times as usual and seems to have moved, both together 2.5 times.
 _MOVING = 3.0
 _FEWEST_IN_GROUPS, _FEWEST_AT_END, _FEWEST_OF_GROUP = 8, 2, 3
 _MOST, _N_REJECTED = 4, 3
-_N_STARTS, _N_ROUNDS = 24, 10
+_N_STARTS, _N_ROUNDS, _N_DIVISIONS = 24, 10, 4
 _MEDIAN_CHI2 = 5.348  # of six degrees of freedom
+_AXES = np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +176,10 @@ class Poses(NamedTuple):
 
     def gain(self, explanation: Explanation, unit: float = 1.0) -> Gain:
         """Compute (2) for a change of the extrinsics, in units of the captures' noise."""
-        return _gain(explanation, *self.score(explanation.weights), _ANY, unit)
+        D = _AXES[:, 2:3] if explanation.cause == "focus_drift" else _AXES
+        h, S = self.score(explanation.weights)
+        found = score_test(explanation, D.T @ h, D.T @ S @ D, _ANY, unit)
+        return found._replace(value=D @ found.value)
 
     def score(self, weights: Array) -> tuple[Array, Array]:
         """Compute h (6,) and S (6, 6) of (2) for a change of the extrinsics with weights (F,)."""
@@ -187,8 +196,8 @@ class Poses(NamedTuple):
         own = np.linalg.solve(self.hessian + 1e-9 * np.eye(6), gradient[..., None])[..., 0]
         return np.asarray(np.einsum("ki,ki->k", gradient, own))
 
-    def without(self, weights: Array, by_z: Array, by_pose: Array) -> Array:
-        """Compute the gradients (F, 6) where an explanation is added.
+    def unit_without(self, weights: Array, by_z: Array, by_pose: Array) -> float:
+        """Measure the noise of single captures under an explanation, in units of the usual noise.
 
         Args:
             weights: (F,) w.
@@ -196,9 +205,13 @@ class Poses(NamedTuple):
             by_pose: (F, 6) derivatives of the captures' gradients, times s.
         """
         step = -self.inverse @ by_z
-        return np.asarray(
-            self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
-        )
+        gradient = self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
+        return _unit(self.singles(gradient))
+
+    def unit_without_change(self, change: Gain) -> float:
+        """Measure the same under a change of the extrinsics."""
+        w, s = change.explanation.weights, change.value
+        return self.unit_without(w, np.tensordot(w, self.by_z, axes=1) @ s, self.hessian @ s)
 
     def moves(self) -> Iterator[Explanation]:
         """List moves before each capture."""
@@ -287,20 +300,17 @@ class Table:
 
     def unit_without(self, row: Gain) -> float:
         """Measure the noise of single captures under an explanation, in units of the usual noise."""
-        w, poses, s = row.explanation.weights, self.poses, row.value
-        if row.cause in MOUNTINGS:
-            by_z, by_pose = np.tensordot(w, poses.by_z, axes=1) @ s, poses.hessian @ s
-        else:
-            along = self._columns(row.cause) @ s
-            by_z = np.tensordot(w, self.cost.hessians, axes=1) @ along
-            by_pose = np.einsum("kga,g->ka", poses.by_z, along)
-        return _unit(poses.singles(poses.without(w, by_z, by_pose)))
+        if row.cause in _OF_POSES:
+            return self.poses.unit_without_change(row)
+        w, along = row.explanation.weights, self._columns(row.cause) @ row.value
+        by_z = np.tensordot(w, self.cost.hessians, axes=1) @ along
+        return self.poses.unit_without(w, by_z, np.einsum("kga,g->ka", self.poses.by_z, along))
 
     def rows(self) -> list[Gain]:
         """List the best explanation of each cause, the most significant first."""
         best: dict[Cause, Gain] = {}
         for explanation in self._candidates():
-            is_of_poses = explanation.cause in MOUNTINGS
+            is_of_poses = explanation.cause in _OF_POSES
             found = self.poses.gain(explanation) if is_of_poses else self._gain(explanation)
             held = best.get(explanation.cause)
             if held is None or found.log10_chance < held.log10_chance:
@@ -332,7 +342,7 @@ class Table:
             if cause in self.causes and is_seen.get(cause, True):
                 yield Explanation(cause, np.ones(F))
         if "focus_drift" in self.causes:
-            yield Explanation("focus_drift", np.linspace(-0.5, 0.5, F))
+            yield Explanation("focus_drift", np.linspace(-0.5, 0.5, F) * self.hypothesis.depths_m)
         cuts = range(_FEWEST_AT_END, F - _FEWEST_AT_END + 1) if "two_boards" in self.causes else ()
         for cut in cuts:
             yield Explanation("two_boards", (np.arange(F) >= cut).astype(np.float64), len(cuts), cut)
@@ -345,7 +355,7 @@ class Table:
         by_z = np.tensordot(w, c.hessians, axes=1) @ D
         hessian = D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D
         h = D.T @ (w @ c.gradients) + by_z.T @ self.step
-        return _gain(explanation, h, hessian - by_z.T @ self.inverse @ by_z, sigma)
+        return score_test(explanation, h, hessian - by_z.T @ self.inverse @ by_z, sigma)
 
     def _columns(self, cause: Cause) -> Array:
         """Return D (G, n) for a constant error."""
@@ -366,12 +376,12 @@ class Table:
             "lens": layout.optics(0),
             "range_scale": layout.z.of(["stretch"]),
             "range_contrast": layout.z.of(["contrast"]),
-            **dict.fromkeys(_OF_SQUARES, layout.z.of(["squares"])),
+            "two_boards": layout.z.of(["squares"]),
         }
         return np.asarray(every[:, at[cause]])
 
 
-def _gain(explanation: Explanation, h: Array, S: Array, sigma: float, unit: float = 1.0) -> Gain:
+def score_test(explanation: Explanation, h: Array, S: Array, sigma: float, unit: float = 1.0) -> Gain:
     """Compute (2) in the directions of s that captures determine better than its standard deviation."""
     information, axes = np.linalg.eigh(sigma**2 * (S + S.T) / 2)
     is_known = information > 1
@@ -421,9 +431,8 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         # other.
         alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
         tried += [r for r in rows if r.cause in alike and r.log10_chance < _LIKELY * rows[0].log10_chance]
-        if rows[0].cause != "drift":
-            # A drift is not settled, and its probability is not that of the others.
-            tried = [row for row in tried if row.cause != "drift"]
+        if rows[0].cause not in _UNSETTLED:
+            tried = [row for row in tried if row.cause not in _UNSETTLED]
         tried += [near for row in tried if row.cause == "moved" for near in table.moves_beside(row)]
         once = {(row.cause, row.explanation.cut): row for row in tried}
         found = [_assume(hypothesis, noisy, row) for row in once.values()]
@@ -443,57 +452,68 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
     if row.cause in _FREED:
         after = now.under(priors=replace(now.priors, **_FREED[row.cause]))
         change = difference(after.T_in_use, now.T_in_use)
-    elif row.cause in ("drift", *_OF_SQUARES):
+    elif row.cause in _UNSETTLED:
         # The likelihood has no such unknown: use its expansion and the noise of single captures.
         unit = Table(now, frozenset()).unit_without(row)
         chance = row.log10_chance / unit if unit < _MOVING**2 else 0.0
-        change = row.value if row.cause == "drift" else np.zeros(6)
-        if row.cause in _OF_SQUARES:
-            # Boards are farther away by the same factor.
-            change[2] = float(row.value[0]) * float(np.mean(now.images.T_cam_board[:, 2, 3]))
+        change = row.value
+        if row.cause in _OF_CAMERA:
+            # Boards are farther or nearer by the same factor.
+            share = float(row.value[2] if row.cause == "focus_drift" else row.value[0])
+            change = share * float(now.depths_m.mean()) * _AXES[2]
         return Selected(row._replace(log10_chance=chance), change, now)
     else:
-        after, change = _split(now, row)
+        after, change, divided = _split(now, row)
+        weights = divided.astype(np.float64)
+        row = row._replace(explanation=replace(row.explanation, weights=weights))
     left = after.with_fitted_noise
     fall = noisy.deviance - left.deviance
     chance = log10_chance(fall, row.freedoms) + np.log10(row.explanation.n_tried)
-    if not np.isfinite(fall) or left.levels.largest_of_images > (
-        _MOVING if row.cause in MOUNTINGS else SCATTER
-    ):
+    noise = left.levels.largest_of_images
+    is_noisy = noise > (_MOVING if row.cause in MOUNTINGS else SCATTER) or left.levels.of_ranges > SCATTER
+    if is_noisy or not np.isfinite(fall):
         chance = 0.0
-    if row.cause in ("moved", "groups") and not _agree(after, row.explanation.weights > 0):
+    members = row.explanation.weights > 0
+    # Most captures of a group fit its mounting; those with individual errors do not.
+    if row.cause in ("moved", "groups") and 2 * _misfits(after, ~members)[members].sum() >= members.sum():
         chance = 0.0
     return Selected(row._replace(log10_chance=min(chance, 0.0)), change, after)
 
 
-def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array]:
+def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array, NDArray[np.bool_]]:
     """Refit with a separate mounting for some captures.
 
+    A group is divided by costs far from their optimum. Captures that then disagree with their mounting
+    change sides, until none does.
+
     Returns:
-        The likelihood, and the change (6,) of the extrinsics from before to after, or from the rest to the
-        group.
+        The likelihood, the change (6,) of the extrinsics from before to after, or from the rest to the group,
+        and the captures (F,) of the separate mounting.
     """
     members = row.explanation.weights > 0
     own, new = int(np.bincount(now.mounting[members]).argmax()), int(now.mounting.max()) + 1
-    kept, mounting = np.unique(np.where(members, new, now.mounting), return_inverse=True)
-    T = now.state.T_cam_lidar
-    after = now.under(
-        mounting=mounting, T_cam_lidar=np.append(T, perturb(T[own], row.value)[None], axis=0)[kept]
-    )
-    if own not in kept:
-        return after, np.zeros(6)
-    T_rest, T_group = after.state.T_cam_lidar[np.searchsorted(kept, [own, new])]
+    T = np.append(now.state.T_cam_lidar, perturb(now.state.T_cam_lidar[own], row.value)[None], axis=0)
+    for _ in range(_N_DIVISIONS):
+        kept, mounting = np.unique(np.where(members, new, now.mounting), return_inverse=True)
+        after = now.under(mounting=mounting, T_cam_lidar=T[kept])
+        if own not in kept:
+            return after, np.zeros(6), members
+        T[kept] = after.state.T_cam_lidar[: len(kept)]
+        changed = members ^ (_misfits(after, ~members) & (now.mounting == own))
+        n_changed = min(changed.sum(), (~changed).sum())
+        if row.cause != "groups" or (changed == members).all() or n_changed < _FEWEST_OF_GROUP:
+            break
+        members = changed
     is_first = row.cause == "moved" and members[0]
-    return after, difference(T_rest, T_group) if is_first else difference(T_group, T_rest)
+    return after, difference(T[own], T[new]) if is_first else difference(T[new], T[own]), members
 
 
-def _agree(after: Hypothesis, members: NDArray[np.bool_]) -> bool:
-    """Check whether most captures of a group fit its mounting; those with individual errors do not."""
+def _misfits(after: Hypothesis, others: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find captures (F,) that disagree with their mounting, by the noise of other ones (F,)."""
     poses = Table(after, frozenset()).poses
     singles = poses.singles(poses.gradient)
-    unit = _unit(singles[~members])
-    is_apart = [log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles[members].tolist()]
-    return 2 * sum(is_apart) < len(is_apart)
+    unit = _unit(singles[others])
+    return np.array([log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles.tolist()])
 
 
 def find_change(cost: Quadratics) -> Gain | None:
@@ -515,8 +535,5 @@ def find_change(cost: Quadratics) -> Gain | None:
     best = min((poses.gain(each) for each in poses.candidates()), key=lambda each: each.log10_chance)
     if best.cause != "moved":
         return None
-    w = best.explanation.weights
-    by_z = np.tensordot(w, poses.by_z, axes=1) @ best.value
-    unit = _unit(poses.singles(poses.without(w, by_z, poses.hessian @ best.value)))
-    found = poses.gain(best.explanation, unit)
+    found = poses.gain(best.explanation, poses.unit_without_change(best))
     return found if found.log10_chance < _LEAST else None

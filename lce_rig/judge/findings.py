@@ -11,8 +11,9 @@ from lce_rig.core.phrasing import fill
 Verdict = Literal["pass", "marginal", "fail"]
 # Probability below which sessions that agree are reported to differ more than predicted.
 _UNLIKELY = 0.05
-_SYMPTOMS = frozenset(
-    (
+_ANY = ""
+_FOLLOWS: Mapping[str, Collection[str]] = {
+    _ANY: (
         "verdict.plane_residual",
         "verdict.edge_residual",
         "verdict.planes_apart",
@@ -22,11 +23,16 @@ _SYMPTOMS = frozenset(
         "verdict.far_from_nominal",
         "verdict.few_used",
         "verdict.scene",
-    )
-)
-"""Symptoms, which any cause may bring about."""
+    ),
+    "verdict.channels_turned": ("verdict.time_offset", "verdict.scatter", "verdict.moved", "verdict.drift"),
+    "verdict.time_offset": ("verdict.scatter",),
+}
+"""Codes of the findings that follow from a cause; symptoms follow from any."""
+_SYMPTOMS = frozenset(_FOLLOWS[_ANY])
 _UNCERTAIN = frozenset(("verdict.rotation_uncertain", "verdict.translation_uncertain"))
-_OF_SIZES = frozenset(("verdict.scale", "verdict.range_offset", "verdict.range_scale"))
+_OF_SIZES = frozenset(
+    ("verdict.scale", "verdict.range_offset", "verdict.range_scale", "verdict.laser_angles")
+)
 _PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
 _FIRST = (
     "association",
@@ -45,11 +51,6 @@ _LACKS = {
     ("verdict.not_certified", ""),
 }
 """Code and action of findings against which more captures help."""
-# Causes with images at wrong places or times, and the findings that result from them.
-_BROUGHT_ABOUT: Mapping[str, Collection[str]] = {
-    "verdict.channels_turned": ("verdict.time_offset", "verdict.scatter", "verdict.moved", "verdict.drift"),
-    "verdict.time_offset": ("verdict.scatter",),
-}
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _CORNERS_TOO = "hold the board in all four corners of the image, tilted by 30 to 45 deg"
@@ -100,7 +101,7 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
     The cause is the worst finding that is not a symptom. Symptoms follow from it, and the cause is as severe
     as the worst of them. Standard deviations follow if the contradiction is their largest part, sizes of the
-    plate if ranges or squares are off.
+    plate if ranges, lasers' angles or squares are off.
     """
     causes = [f for f in findings if f.severity != "note" and f.code not in _SYMPTOMS | _UNCERTAIN]
     sizes = [f for f in findings if f.code in _OF_SIZES]
@@ -119,9 +120,9 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
             return sizes[0].code
         if cause is None or finding is cause or finding.severity == "note":
             return ""
-        is_symptom = finding.code in _SYMPTOMS or (finding.code in _UNCERTAIN and finding.action == "resolve")
-        follows_it = finding.code in _BROUGHT_ABOUT.get(cause.code, ())
-        return cause.code if is_symptom or follows_it else ""
+        is_widened = finding.code in _UNCERTAIN and finding.action == "resolve"
+        follows_it = finding.code in (*_FOLLOWS[_ANY], *_FOLLOWS.get(cause.code, ()))
+        return cause.code if is_widened or follows_it else ""
 
     placed = [replace(f, follows=follows(f)) for f in findings if f is not cause]
     # Sizes of the plate that follow from a note are notes.
@@ -279,6 +280,12 @@ def _range_scale(finding: Finding) -> str:
     return (
         f"ranges of {finding.subject} are {abs(scale):.1f} +- {sigma:.1f} % too {side}, or all of the board"
     )
+
+
+def _scattered(finding: Finding) -> str:
+    """Board poses in images, or ranges of {subject}, scatter {ratio} times as much as usual."""
+    what = f"ranges of {finding.subject}" if finding.subject else "board poses in images"
+    return fill(f"{what} scatter {{ratio:.0f}} times as much as usual, cause unknown", finding.figures)
 
 
 def _moved(finding: Finding) -> str:
@@ -496,9 +503,10 @@ FOCUS_DRIFT = Kind(
 )
 SCATTERED = Kind(
     "verdict.scatter",
-    "board poses in images scatter {ratio:.0f} times as much as usual, cause unknown",
+    _scattered,
     "hold the board still and check the image-scan matching",
     severity="warning",
+    actions={"ranges": "check the LiDAR's mode and the board's surface, and collect again"},
 )
 TIME_OFFSET = Kind(
     "verdict.time_offset",

@@ -18,7 +18,7 @@ from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, composition_slopes, invert
-from lce_rig.judge.explanations import Table, log10_chance
+from lce_rig.judge.explanations import Explanation, Table, score_test
 from lce_rig.judge.findings import MOVED
 from lce_rig.judge.validate import Validation
 
@@ -160,11 +160,12 @@ def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
     ]
     for shown in (pair.moved for pair in pairs if pair.moved is not None and sensor in pair.sensors):
         first_after = _first_after(shown)
-        h, S = np.zeros(6), np.eye(6) / _KNOWN**2
+        h, S = np.zeros(6), np.zeros((6, 6))
         for captures, poses, A in own:
             slope, information = poses.score(np.array([float(name >= first_after) for name in captures]))
             h, S = h + A.T @ slope, S + A.T @ information @ A
-        yield MovedSensor(sensor, first_after, log10_chance(float(h @ np.linalg.solve(S, h)), 6), shown)
+        found = score_test(Explanation("moved", np.empty(0)), h, S, _KNOWN)
+        yield MovedSensor(sensor, first_after, found.log10_chance, shown)
 
 
 def _first_after(moved: Finding) -> str:

@@ -19,6 +19,8 @@ METHODS: tuple[Method, ...] = ("paper", "ml")
 VERDICTS = (*get_args(Verdict), "refused")
 # An error beyond so many reported standard deviations, or targets of the profile, is a wrong result.
 _WRONG = 3.0
+# Error of a mistake without effect, in targets: half of one adds 12 % to a standard deviation of one target.
+_HARMLESS = 0.5
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,11 @@ class Outcome:
     def is_unnoticed(self) -> bool:
         """Whether it passes, its cause is not named, and the error is within the standard deviations."""
         return self.verdict == "pass" and not self.is_right and not self.is_wrong
+
+    @property
+    def is_harmless(self) -> bool:
+        """Whether it is unnoticed and leaves the extrinsics right: a pass is the right verdict."""
+        return self.is_unnoticed and self.in_targets <= _HARMLESS
 
     @property
     def second_causes(self) -> tuple[str, ...]:
@@ -156,7 +163,8 @@ def print_causes(outcomes: Sequence[Outcome]) -> None:
     corrupted = [o for o in outcomes if o.corruption != SOUND and not o.unobservable]
     beyond = [o for o in corrupted if o.is_beyond]
     print_head(
-        *["method", "beyond tolerance", "first cause right", "second false cause"],
+        *["method", "beyond tolerance", "of them harmless", "others", "first cause right"],
+        "second false cause",
         *["passes unnoticed within 3 sigmas", "passes over 3 sigmas"],
         *["within tolerance", "false cause", "sound", "false cause"],
     )
@@ -169,8 +177,11 @@ def print_causes(outcomes: Sequence[Outcome]) -> None:
                 [o for o in outcomes if o.corruption == SOUND],
             )
         )
+        n_beyond, large = len(large), [o for o in large if not o.is_harmless]
         print_row(
             method,
+            n_beyond,
+            n_beyond - len(large),
             len(large),
             share(o.is_right for o in large),
             share(bool(o.second_causes) for o in large),
@@ -185,7 +196,7 @@ def print_causes(outcomes: Sequence[Outcome]) -> None:
     print_head("session", "corruption", "method", "verdict", "first cause", "other causes", "in sigmas")
     for o in beyond:
         if not o.is_right:
-            others = ", ".join(code for code in o.causes if code != o.cause)
+            others = "(harmless)" if o.is_harmless else ", ".join(c for c in o.causes if c != o.cause)
             of_recording = " (of the recording)" if o.cause in o.faults else ""
             first = f"{o.cause or '-'}{of_recording}"
             print_row(o.session, o.corruption, o.method, o.verdict, first, others, f"{o.in_sigmas:.1f}")
@@ -198,12 +209,14 @@ def print_causes(outcomes: Sequence[Outcome]) -> None:
 
 
 def measure_causes(outcomes: Sequence[Outcome]) -> None:
-    """Keep each session's counts of mistakes beyond the profile's tolerances."""
+    """Keep each session's counts of mistakes beyond the profile's tolerances, and of harmless ones apart."""
     beyond = [o for o in outcomes if o.corruption != SOUND and not o.unobservable and o.is_beyond]
     for session, method in {(o.session, o.method): None for o in beyond}:
-        own = [o for o in beyond if (o.session, o.method) == (session, method)]
+        every = [o for o in beyond if (o.session, o.method) == (session, method)]
+        own = [o for o in every if not o.is_harmless]
         key, n_right = f"corruptions.{session}.{method}", sum(o.is_right for o in own)
         measure(f"{key}.mistakes", "{}", len(own))
+        measure(f"{key}.harmless", "{}", len(every) - len(own))
         measure(f"{key}.right", "{} ({:.0f} %)", n_right, 100 * n_right / len(own))
         measure(f"{key}.second", "{}", sum(bool(o.second_causes) for o in own))
         measure(f"{key}.unnoticed", "{}", sum(o.is_unnoticed for o in own))

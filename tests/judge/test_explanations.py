@@ -106,6 +106,35 @@ def test_explain_two_boards_are_named():
     assert float(found.gain.value[0]) == pytest.approx(0.1, abs=0.03)
 
 
+def test_explain_groups_are_divided_exactly():
+    observations = moved(observed(16, 3), lambda k: k % 4 == 1, [0, 0, 0, 0, np.radians(1.5), 0])
+    found, *_ = explained(observations)
+    assert found.gain.cause == "groups"
+    assert np.flatnonzero(found.gain.explanation.weights).tolist() == [1, 5, 9, 13]
+    assert tangent_sizes(found.change)[0] == pytest.approx(1.5, abs=0.1)
+
+
+def test_explain_focus_drift_is_no_drift_of_the_mounting():
+    drifted = []
+    for k, o in enumerate(observed(16, 3)):
+        T = o.image.T_cam_board.copy()
+        T[2, 3] /= 1 + 0.01 * k / 15
+        drifted.append(seen_at(o, T))
+    found, *_ = explained(drifted)
+    assert found.gain.cause == "focus_drift"
+    assert found.gain.value[2] == pytest.approx(-0.01, abs=0.003)
+
+
+def test_explain_noisy_ranges_name_no_constant_error():
+    rng = np.random.default_rng(2)
+
+    def noisy(points: Array, ring: Array) -> Array:
+        range_m = np.linalg.norm(points, axis=1, keepdims=True)
+        return points * (1 + 0.05 * rng.standard_normal(range_m.shape) / range_m)
+
+    assert causes([with_points(o, noisy) for o in observed(16, 3)]) == []
+
+
 @pytest.mark.long
 def test_explain_drift_is_named():
     observations = [

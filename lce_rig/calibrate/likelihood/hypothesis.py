@@ -49,7 +49,7 @@ class Hypothesis:
         priors: prior standard deviations of the constant errors.
         captures: (F,) names, sorted.
         mounting: (F,) number of each capture's mounting.
-        T_lidar_board: (F, 4, 4) poses of the boards by the estimate, or by the scan alone if it has none.
+        T_lidar_board: (F, 4, 4) poses of the boards by the scans alone.
         is_further: (F,) True for captures that the estimate does not use.
     """
 
@@ -71,6 +71,12 @@ class Hypothesis:
     def reduced(self) -> Reduced:
         """The normal equations."""
         return assemble(self.terms, self.levels, self.priors)
+
+    @property
+    def depths_m(self) -> Array:
+        """(F,) depths of the boards before the camera."""
+        T_cam_board = self.state.T_cam_lidar[self.mounting] @ self.state.T_lidar_board
+        return np.asarray(T_cam_board[:, 2, 3])
 
     @property
     def T_in_use(self) -> Array:
@@ -122,7 +128,7 @@ class Hypothesis:
             T_cam_lidar = np.array([*T_cam_lidar, *([np.eye(4)] if of_base else [])])
             split += of_base
             # A wrong mounting has displaced boards from their positions in the scans.
-            is_new = ((mounting != self.mounting) & self.is_further)[:, None, None]
+            is_new = (mounting != self.mounting)[:, None, None]
             T_lidar_board = np.where(is_new, self.T_lidar_board, old.T_lidar_board)
             state = State(layout, T_cam_lidar, T_lidar_board, old.own_shift_m, z)
             terms = linearise(terms.scans, split, terms.board, state, terms.trust)
@@ -149,7 +155,8 @@ def at_full_weight(
     names, scans, images = stack_captures([observations], board, lenses, None)
     base = None if len(images) == 1 else 1
     T_cameras = np.stack([T_cam_lidar, *([] if base is None else [np.eye(4)])])
-    starts = {o.capture: (_nearest_turn(o, T_cam_lidar), 0.0) for o in observations}
+    by_scan = {o.capture: _nearest_turn(o, T_cam_lidar) for o in observations}
+    starts = {name: (T, 0.0) for name, T in by_scan.items()}
     settled = zip(joint.state.T_lidar_board, joint.state.own_shift_m.tolist(), strict=True)
     starts |= dict(zip(joint.captures, settled, strict=True))
     T_lidar_board = np.array([starts[name][0] for name in names])
@@ -165,7 +172,8 @@ def at_full_weight(
         terms = linearise(scans, images, board, terms.state.moved(np.zeros(layout.z.size), own), trust)
     alike = np.zeros(len(names), dtype=np.intp)
     is_further = np.array([name not in joint.captures for name in names])
-    return Hypothesis(terms, images[0], levels, priors, names, alike, T_lidar_board, is_further).under()
+    T_by_scan = np.array([by_scan[name] for name in names])
+    return Hypothesis(terms, images[0], levels, priors, names, alike, T_by_scan, is_further).under()
 
 
 def _nearest_turn(observation: Observation, T_cam_lidar: Array) -> Array:

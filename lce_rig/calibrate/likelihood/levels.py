@@ -56,6 +56,11 @@ class Levels:
         return max(self.ratio(name) for name in OF_IMAGES)
 
     @property
+    def of_ranges(self) -> float:
+        """`ratio` of the noise of single ranges."""
+        return self.ratio("range_m")
+
+    @property
     def with_usual_images(self) -> "Levels":
         """Reset the images' levels to their defaults."""
         return replace(self, **{name: getattr(Levels(), name) for name in OF_IMAGES})
