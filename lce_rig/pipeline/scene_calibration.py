@@ -253,15 +253,17 @@ def _of_folder(recording: FolderRecording, notes: list[str], progress: Progress)
 
 def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> list[View]:
     require_sensors(recording, rig)
-    losses, kept = Losses(), Thinned[View](_MOST_VIEWS)
+    losses, with_images, of_events = Losses(), Thinned[View](_MOST_VIEWS), Thinned[View](_MOST_VIEWS)
     previous: dict[str, Scan] = {}
     samples = read_samples(recording, rig, progress)
     for frame in pair_by_time(samples, rig, losses, are_events_enough=True):
         events = events_at_scans(frame.events, frame.scans, rig)
         if frame.scans and (frame.images or events):
             name = f"{1e-9 * frame.time_ns:.2f} s"
-            kept.take(View(name, frame.images, frame.scans, events, previous))
+            views = with_images if frame.images else of_events
+            views.take(View(name, frame.images, frame.scans, events, previous))
         previous = {scan.sensor: scan for scan in frame.scans}
+    kept = with_images or of_events  # Images show what stands still, too.
     if not kept and losses.counts():
         (why, n), *_ = losses.counts()
         raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")

@@ -203,7 +203,7 @@ def later(sample, by_ns):
     """Move a scan or events to a later time."""
     if isinstance(sample, Events):
         return replace(sample, t_ns=sample.t_ns + by_ns)
-    return replace(sample, stamp_ns=sample.stamp_ns + by_ns)
+    return replace(sample, stamp_ns=sample.stamp_ns + by_ns, host_ns=sample.stamp_ns + by_ns + PERIOD_NS)
 
 
 def test_scene_calibration_stores_events_of_bag(event_drive, tmp_path):
