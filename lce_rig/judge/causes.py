@@ -22,9 +22,11 @@ from lce_rig.judge.findings import (
     LASER_ANGLES,
     LENS,
     MOVED,
+    OF_SIZES,
     OUTLIER,
     PATTERN_OFFSET,
     PLATE_SIZE,
+    PLATES,
     RANGE_CONTRAST,
     RANGE_OFFSET,
     RANGE_SCALE,
@@ -133,7 +135,9 @@ def contradiction_of(
         findings: their findings.
         used: captures of the result.
     """
-    codes = [each.code for each in findings if each.severity != "note"]
+    codes = {each.code for each in findings if each.severity != "note"}
+    if OF_SIZES.intersection(each.code for each in findings):
+        codes -= PLATES  # They follow.
     for each in selected:
         code = _CODES[each.gain.cause]
         if code in codes and not _is_over(each, used):

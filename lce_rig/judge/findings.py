@@ -30,10 +30,10 @@ _FOLLOWS: Mapping[str, Collection[str]] = {
 """Codes of the findings that follow from a cause; symptoms follow from any."""
 _SYMPTOMS = frozenset(_FOLLOWS[_ANY])
 _UNCERTAIN = frozenset(("verdict.rotation_uncertain", "verdict.translation_uncertain"))
-_OF_SIZES = frozenset(
-    ("verdict.scale", "verdict.range_offset", "verdict.range_scale", "verdict.laser_angles")
-)
-_PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
+OF_SIZES = frozenset(("verdict.scale", "verdict.range_offset", "verdict.range_scale", "verdict.laser_angles"))
+"""Causes from which wrong sizes of the plate follow."""
+PLATES = frozenset(("verdict.plate_size", "verdict.plate_edge"))
+"""Findings of wrong sizes of the plate."""
 _FIRST = (
     "association",
     "verdict.exchanged",
@@ -104,9 +104,9 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     plate if ranges, lasers' angles or squares are off.
     """
     causes = [f for f in findings if f.severity != "note" and f.code not in _SYMPTOMS | _UNCERTAIN]
-    sizes = [f for f in findings if f.code in _OF_SIZES]
+    sizes = [f for f in findings if f.code in OF_SIZES]
     if sizes:
-        causes = [f for f in causes if f.code not in _PLATES]
+        causes = [f for f in causes if f.code not in PLATES]
     order = {id(f): k for k, f in enumerate(findings)}
 
     def rank(finding: Finding) -> tuple[bool, bool, int]:
@@ -116,7 +116,7 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     cause = min(causes, key=rank, default=None)
 
     def follows(finding: Finding) -> str:
-        if sizes and finding.code in _PLATES:
+        if sizes and finding.code in PLATES:
             return sizes[0].code
         if cause is None or finding is cause or finding.severity == "note":
             return ""
@@ -127,7 +127,7 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     placed = [replace(f, follows=follows(f)) for f in findings if f is not cause]
     # Sizes of the plate that follow from a note are notes.
     is_harmless = bool(sizes) and all(f.severity == "note" for f in sizes)
-    placed = [replace(f, severity="note") if is_harmless and f.code in _PLATES else f for f in placed]
+    placed = [replace(f, severity="note") if is_harmless and f.code in PLATES else f for f in placed]
     if cause is not None:
         worst_of = worst([cause, *(f for f in placed if f.follows == cause.code)])
         placed = [replace(cause, severity=worst_of, follows=""), *placed]
@@ -136,7 +136,7 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def is_symptom_alone(findings: Sequence[Finding]) -> bool:
     """Check whether all reasons are symptoms without a cause."""
-    follow = _SYMPTOMS | (_PLATES if any(f.code in _OF_SIZES for f in findings) else frozenset())
+    follow = _SYMPTOMS | (PLATES if any(f.code in OF_SIZES for f in findings) else frozenset())
     codes = [f.code for f in findings if f.severity != "note" and f.code not in _UNCERTAIN]
     return bool(codes) and all(code in follow for code in codes)
 
