@@ -191,11 +191,12 @@ def test_causes_table_counts_right_and_second_ones(capsys):
             outcome(SOUND, "", verdict="pass"),
             outcome("squares", "verdict.scale", "verdict.moved", expected=expected),
             outcome("squares", "verdict.moved", expected=expected),
+            outcome("plate", "", expected=expected, verdict="pass"),
             outcome("focal length", "verdict.moved", expected=expected, is_beyond=False),
         ]
     )
-    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| ml | 2"))
-    assert row == "| ml | 2 | 1 (50 %) | 1 (50 %) | 0 (0 %) | 0 | 1 | 1 (100 %) | 1 | 0 (0 %) |"
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| ml | 3"))
+    assert row == "| ml | 3 | 1 | 2 | 1 (50 %) | 1 (50 %) | 0 (0 %) | 0 | 1 | 1 (100 %) | 1 | 0 (0 %) |"
 
 
 def test_measured_causes_count_mistakes_beyond_tolerance():
