@@ -93,7 +93,7 @@ class View:
     Attributes:
         name: name of the capture that holds them.
         images, scans: of all sensors; scans as recorded.
-        events: of each event camera, while the scans were fired.
+        events: of each event camera without an image, while the scans were fired.
         previous: the scans before, by LiDAR; empty where the recording is not continuous.
     """
 
@@ -257,7 +257,9 @@ def _of_stream(recording: ContinuousRecording, rig: Rig, progress: Progress) -> 
     previous: dict[str, Scan] = {}
     samples = read_samples(recording, rig, progress)
     for frame in pair_by_time(samples, rig, losses, are_events_enough=True):
-        events = events_at_scans(frame.events, frame.scans, rig)
+        shown = {image.sensor for image in frame.images}
+        unseen = [cut for cut in frame.events if cut.sensor not in shown]
+        events = events_at_scans(unseen, frame.scans, rig)
         if frame.scans and (frame.images or events):
             name = f"{1e-9 * frame.time_ns:.2f} s"
             views = with_images if frame.images else of_events
