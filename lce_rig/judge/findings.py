@@ -24,6 +24,7 @@ _FOLLOWS: Mapping[str, Collection[str]] = {
         "verdict.few_used",
         "verdict.scene",
     ),
+    "association.mirrored": ("verdict.intrinsics",),
     "verdict.channels_turned": ("verdict.time_offset", "verdict.scatter", "verdict.moved", "verdict.drift"),
     "verdict.time_offset": ("verdict.scatter",),
 }
