@@ -15,7 +15,7 @@ from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.judge.scene_drift import SceneDrift, watch_scene
-from lce_rig.pipeline.scene_samples import channel_of, picture_of, seconds_to_image
+from lce_rig.pipeline.scene_samples import at_image, channel_of, moving, picture_of
 from lce_rig.rig import Rig
 from lce_rig.scene.estimate import HOLDS_CHI2
 from lce_rig.scene.findings import (
@@ -27,7 +27,7 @@ from lce_rig.scene.findings import (
     NO_SAMPLES,
 )
 from lce_rig.scene.outline_score import OutlineView
-from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s
 from lce_rig.scene.views import build_view, evenly, without_board, without_movers
 from lce_rig.show.overlays.canvas import write_picture
 from lce_rig.show.overlays.overlay import draw_edges
@@ -164,20 +164,19 @@ class PairJudge:
         views: list[OutlineView] = []
         whole: list[OutlineView] = []
         boards: list[tuple[Seen, ImageBoard]] = []
-        moving: list[MovingView] = []
+        in_motion: list[MovingView] = []
         n_untimed = 0
         for seen in kept:
             view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
             motion = self._motion(seen)
             if motion is not None:
                 late_ns = own_offset_ns(c, channel_of(seen.image, self._rig))
-                after_s = seconds_to_image(view.outlines.points, seen.scan, seen.image, self._rig, late_ns)
-                if after_s is None:
+                moved = at_image(view, motion, seen.scan, seen.image, self._rig, late_ns)
+                if moved is None:
                     n_untimed += 1
                     continue
-                points = motion.moved(view.outlines.points, after_s)
-                view = replace(view, outlines=replace(view.outlines, points=points))
-                moving.append(MovingView(view, motion))
+                view = moved
+                in_motion.append(MovingView(view, motion))
             whole.append(view)
             if isinstance(seen.image, Image):
                 board = self._finder.image(seen.image)
@@ -190,13 +189,17 @@ class PairJudge:
             views = without_movers(views)
         judged = watch_scene(views, lens, c)
         others: list[Finding] = []
-        if len(moving) >= _MIN_MOVING and judged.estimate.state != "few_edges":
-            others += _clocks(judged, moving, lens, c.camera)
+        if len(in_motion) >= _MIN_MOVING and judged.estimate.state != "few_edges":
+            others += _clocks(judged, in_motion, lens, c.camera)
         if not kept:
             others.append(NO_SAMPLES(c.camera, lidar=c.lidar))
         elif n_untimed:
             others.append(NO_FIRING_TIMES(c.lidar, n_captures=n_untimed))
-        if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
+        if (
+            judged.state == "unknown"
+            and not in_motion
+            and any(isinstance(each.image, Events) for each in kept)
+        ):
             others.append(EVENTS_OF_STANDING_RIG(c.camera))
         judged = replace(judged, others=tuple(others))
         example = None
@@ -221,19 +224,16 @@ class PairJudge:
 
     def _motion(self, seen: Seen) -> RigMotion | None:
         """Estimate the rig's motion at a capture; None if it stands still or cannot be estimated."""
-        if seen.previous is None:
-            return None
         key = id(seen.scan)
         if key not in self._motions:
-            motion = estimate_motion(seen.previous, seen.scan)
-            self._motions[key] = None if motion is None or motion.is_still else motion
+            self._motions[key] = moving(seen.previous, seen.scan)
         return self._motions[key]
 
 
-def _clocks(judged: SceneDrift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> list[Finding]:
+def _clocks(judged: SceneDrift, views: Sequence[MovingView], lens: Intrinsics, camera: str) -> list[Finding]:
     """Check whether the images of a moving rig fit scans of another time as well as a change."""
     is_changed = judged.state == "changed"
-    apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
+    apart_s = clocks_apart_s(views, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
     if apart_s is None:
         return []
     return [(CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)]

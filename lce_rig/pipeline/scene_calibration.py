@@ -52,12 +52,13 @@ from lce_rig.pipeline.findings import (
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.scene_samples import (
     Thinned,
+    at_image,
     channel_of,
     events_at_scans,
     image_or_events,
+    moving,
     picture_of,
     read_events,
-    seconds_to_image,
 )
 from lce_rig.rig import NominalExtrinsic, Rig
 from lce_rig.scene.estimate import (
@@ -68,7 +69,6 @@ from lce_rig.scene.estimate import (
     follow_lens,
 )
 from lce_rig.scene.outline_score import OutlineView, build_outline_view
-from lce_rig.scene.rig_motion import RigMotion, estimate_motion
 from lce_rig.scene.views import evenly
 from lce_rig.session import Session
 from lce_rig.session.identity import MARKER
@@ -323,15 +323,15 @@ def calibrate_pair(
         if image is None:
             continue
         built = build_outline_view(view.name, image, scan, beam, lens, T_nominal)
-        motion = _motion(rig, view, scan)
+        previous = view.previous.get(lidar)
+        motion = moving(None if previous is None else rig.corrected(previous), scan)
         if motion is not None:
             is_standing = False
-            after_s = seconds_to_image(built.outlines.points, scan, image, rig)
-            if after_s is None:
+            moved = at_image(built, motion, scan, image, rig)
+            if moved is None:
                 n_untimed += 1
                 continue
-            points = motion.moved(built.outlines.points, after_s)
-            built = replace(built, outlines=replace(built.outlines, points=points))
+            built = moved
         outlined.append(built)
         images.append(image)
     subject = f"{camera} and {lidar}"
@@ -391,13 +391,6 @@ def _with_lens(
     used = follow_lens(views, prior.lens, estimate.T_cam_lidar, changes)
     used[3:] += turn_of_lens(prior.lens) @ changes
     return np.asarray(estimate.cov + used @ used.T), np.asarray(used @ changes.T), cov_lens
-
-
-def _motion(rig: Rig, view: View, scan: Scan) -> RigMotion | None:
-    """Estimate the rig's motion at a view; None if it stands still or cannot be estimated."""
-    previous = view.previous.get(scan.sensor)
-    motion = None if previous is None else estimate_motion(rig.corrected(previous), scan)
-    return None if motion is None or motion.is_still else motion
 
 
 def _shortage(subject: str, estimate: SceneEstimate, images: Sequence[Image | Events]) -> Finding | None:

@@ -10,7 +10,8 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.rig import Rig
-from lce_rig.scene.rig_motion import firing_times_s
+from lce_rig.scene.outline_score import OutlineView
+from lce_rig.scene.rig_motion import RigMotion, estimate_motion, firing_times_s
 from lce_rig.session import Capture
 from lce_rig.show.overlays.canvas import accumulated
 from lce_rig.timing.scan_pairing import EventCut, event_channel, rig_offset_ns, rig_time_ns, stream_of
@@ -117,25 +118,34 @@ def image_or_events(
     return replace(about.events, **columns)
 
 
-def seconds_to_image(
-    points: Array, scan: Scan, image: Image | Events, rig: Rig, late_ns: int = 0
-) -> Array | None:
-    """Compute the time (N,) from the firing of each point (N, 3) of a scan to the image; None if unknown.
+def moving(previous: Scan | None, scan: Scan) -> RigMotion | None:
+    """Estimate the rig's motion at a scan; None if it stands still or cannot be estimated."""
+    motion = None if previous is None else estimate_motion(previous, scan)
+    return None if motion is None or motion.is_still else motion
+
+
+def at_image(
+    view: OutlineView, motion: RigMotion, scan: Scan, image: Image | Events, rig: Rig, late_ns: int = 0
+) -> OutlineView | None:
+    """Move the outlines of a scan to the time of the image; None if times are unknown.
 
     Args:
-        points: frame lidar.
-        scan: holds the points, or returns beside them.
+        view: of the scan and the image.
+        motion: the rig's at the scan.
+        scan: holds the outlines' points, or returns beside them.
         image: of the camera, or the events chosen in its place.
         rig: the profile.
         late_ns: time offset of the image's channel beyond the one that the profile expects.
     """
+    points = view.outlines.points
     scan_ns, image_ns = rig_time_ns(scan, rig), rig_time_ns(image, rig)
     fired_s = firing_times_s(scan, points)
     if scan_ns is None or image_ns is None or fired_s is None:
         return None
     # Events were cut about their middle.
     middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
-    return np.asarray(1e-9 * (image_ns + middle_ns + late_ns - scan_ns) - fired_s)
+    after_s = 1e-9 * (image_ns + middle_ns + late_ns - scan_ns) - fired_s
+    return replace(view, outlines=replace(view.outlines, points=motion.moved(points, after_s)))
 
 
 def channel_of(image: Image | Events, rig: Rig) -> str:
