@@ -1,5 +1,6 @@
 """Outlines of near objects in a point cloud, with the direction across each."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,21 +58,18 @@ class _Neighbours:
     """The nearest returns by angle.
 
     Attributes:
-        index: (N, K) of the neighbour.
-        apart_rad: (N, K, 2) azimuth times the cosine of elevation, and elevation, to the neighbour.
+        index: (N, K) of the neighbour; without meaning where not near.
+        apart_rad: (2, N, K) azimuth times the cosine of elevation, and elevation, to the neighbour.
         farther_m: (N, K) its range less the own.
         is_near: (N, K) whether the angle is small enough.
+        sectors: (N, K) near neighbours in the quarter about each direction: an axis and a side, 1 or -1.
     """
 
     index: NDArray[np.intp]
     apart_rad: Array
     farther_m: Array
     is_near: NDArray[np.bool_]
-
-    def sector(self, axis: int, side: int) -> NDArray[np.bool_]:
-        """Find the neighbours (N, K) in the quarter about one direction."""
-        along, across = side * self.apart_rad[..., axis], np.abs(self.apart_rad[..., 1 - axis])
-        return np.asarray(self.is_near & (along > across), dtype=np.bool_)
+    sectors: Mapping[tuple[int, int], NDArray[np.bool_]]
 
 
 def find_outlines(points: NDArray[Any], intensity: NDArray[Any], beam: Beam) -> Outlines:
@@ -103,11 +101,19 @@ def _neighbours(points: Array, range_m: Array) -> _Neighbours:
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     elevation = np.arcsin(np.clip(points[:, 2] / range_m, -1.0, 1.0))
     # Angles on the sphere, by chords, so that neither the seam behind the LiDAR nor the poles matter.
-    distance, index = cKDTree(points / range_m[:, None]).query(points / range_m[:, None], _N_NEIGHBOURS + 1)
-    index, is_near = index[:, 1:], distance[:, 1:] < _NEAR_RAD
+    rays = points / range_m[:, None]
+    _, index = cKDTree(rays).query(rays, _N_NEIGHBOURS + 1, distance_upper_bound=_NEAR_RAD)
+    n_near = np.sum(index < len(rays), axis=1)  # including the point itself, the first
+    index = index[:, 1 : max(int(n_near.max()), 2)]
+    is_near = index < len(rays)
+    index = np.where(is_near, index, 0)
     turn = np.remainder(azimuth[index] - azimuth[:, None] + np.pi, 2 * np.pi) - np.pi
-    apart = np.stack([turn * np.cos(elevation)[:, None], elevation[index] - elevation[:, None]], axis=-1)
-    return _Neighbours(index, apart, range_m[index] - range_m[:, None], is_near)
+    apart = np.stack([turn * np.cos(elevation)[:, None], elevation[index] - elevation[:, None]])
+    across = np.abs(apart[::-1])
+    sectors = {
+        (axis, side): is_near & (side * apart[axis] > across[axis]) for axis in (0, 1) for side in (1, -1)
+    }
+    return _Neighbours(index, apart, range_m[index] - range_m[:, None], is_near, sectors)
 
 
 def _jumps(
@@ -117,8 +123,8 @@ def _jumps(
 
     The near surface goes on to the other side: a return between two surfaces is a blend of both.
     """
-    along = side * near.apart_rad[..., axis]
-    beyond, within = near.sector(axis, side), near.sector(axis, -side)
+    along = side * near.apart_rad[axis]
+    beyond, within = near.sectors[axis, side], near.sectors[axis, -side]
     jump = np.where(beyond, near.farther_m, np.inf).min(axis=1)
     gap_rad = np.where(beyond, along, np.inf).min(axis=1)
     before = np.where(within, -along, np.inf).argmin(axis=1)[:, None]
@@ -157,7 +163,7 @@ def _changes(
     level = np.minimum(intensity / bright, 1.0)[near.index]
     means, spread, is_seen = [], np.zeros(len(points)), np.ones(len(points), dtype=bool)
     for side in (1, -1):
-        chosen = near.sector(0, side)
+        chosen = near.sectors[0, side]
         count = np.maximum(chosen.sum(axis=1), 1)
         mean = (level * chosen).sum(axis=1) / count
         spread += np.maximum((level**2 * chosen).sum(axis=1) / count - mean**2, 0.0)
@@ -167,7 +173,7 @@ def _changes(
     is_edge = is_seen & (change > _FAINT) & (change > _CHANGE_SIGMAS * np.sqrt(spread))
     is_edge &= np.where(near.is_near, np.abs(near.farther_m), 0.0).max(axis=1) < _joint_m(range_m)
     contrast = np.where(is_edge, change / (means[0] + means[1] + 2 * _FAINT), 0.0)
-    beside = near.sector(0, 1) | near.sector(0, -1)
+    beside = near.sectors[0, 1] | near.sectors[0, -1]
     largest = np.where(beside, contrast[near.index], 0.0).max(axis=1)
     kept = np.flatnonzero((contrast > _CONTRAST) & (contrast >= largest))
     return points[kept], np.sqrt(contrast[kept]), np.full(len(kept), REFLECTIVITY, dtype=np.int8)
