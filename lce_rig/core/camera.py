@@ -87,10 +87,8 @@ class Intrinsics:
         falling = np.flatnonzero(growth <= 0)
         return float(r[falling[0]]) if len(falling) else float(limit)
 
-    def _coefficients(self, n: int) -> Array:
-        padded = np.zeros(n)
-        padded[: len(self.distortion)] = self.distortion
-        return padded
+    def _coefficients(self, n: int) -> tuple[float, ...]:
+        return (*self.distortion, *(0.0,) * (n - len(self.distortion)))
 
     def _distorted_radius(self, r: Array) -> Array:
         if self.model == "equidistant":
@@ -101,7 +99,7 @@ class Intrinsics:
 
     def _radius_slope(self, angle: Array) -> Array:
         """Differentiate the distorted radius by the angle (equidistant only)."""
-        k, s = self._coefficients(4) * [3, 5, 7, 9], angle * angle
+        k, s = np.multiply(self._coefficients(4), [3, 5, 7, 9]), angle * angle
         return np.asarray(1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
 
     def _radial_scale(self, s: Array) -> Array:
@@ -115,13 +113,10 @@ class Intrinsics:
         x, y = xy[..., 0], xy[..., 1]
         s = x * x + y * y
         scale = self._radial_scale(s)
-        return np.stack(
-            [
-                x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x),
-                y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        distorted = np.empty((*x.shape, 2))
+        distorted[..., 0] = x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+        distorted[..., 1] = y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+        return distorted
 
     def _distortion_slope(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Differentiate `_distort`: d x' / dx, d x' / dy = d y' / dx, d y' / dy."""
@@ -184,7 +179,8 @@ class Intrinsics:
         Returns:
             (..., 2, 3) px per m; without meaning where `project` is not valid.
         """
-        x, y, z = np.moveaxis(np.asarray(points_camera, dtype=np.float64), -1, 0)
+        points = np.asarray(points_camera, dtype=np.float64)
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
         slope = np.empty((*x.shape, 2, 3))
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.model == "equidistant":
