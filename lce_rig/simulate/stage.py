@@ -155,7 +155,7 @@ def set_stage(
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
-        options.furnish,
+        options.decoys,
     )
     sheets: dict[str, DataSheet] = {}
     for name, settings in rig.lidars.items():
