@@ -173,11 +173,11 @@ def lidar_intrinsics(
         show.note(f"written: {save_profile}")
 
 
-# Name, keys of a laser's row, scale to the printed unit, digits, unit.
+# Name, keys of a laser's row, factor to the printed unit, digits, unit.
 _ERRORS = (
-    ("range", "range_m", "range_sigma_m", 1000.0, 1, "mm"),
-    ("azimuth", "azimuth_deg", "azimuth_sigma_deg", 1.0, 3, "deg"),
-    ("elevation", "elevation_deg", "elevation_sigma_deg", 1.0, 3, "deg"),
+    ("range", "range_m", "range_sigma_m", 1000, 1, "mm"),
+    ("azimuth", "azimuth_deg", "azimuth_sigma_deg", 1, 3, "deg"),
+    ("elevation", "elevation_deg", "elevation_sigma_deg", 1, 3, "deg"),
 )
 
 

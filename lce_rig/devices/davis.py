@@ -30,7 +30,6 @@ _N_SLOTS = 2048
 _PAUSE_S, _SILENCE_S = 0.002, 5.0
 _MAX_CLOCK_ERROR_MS = 500.0
 _RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
-_US_S = 1e6
 _US = timedelta(microseconds=1)
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
 _OTHER_MODEL = "Check driver.device and resolution_px: it may be another model."
@@ -173,7 +172,7 @@ class DavisSource(LiveSource):
         if pixels.shape[1::-1] != self._settings.resolution_px:
             raise self._wrong_size(f"frames of {pixels.shape[1]}x{pixels.shape[0]} px")
         self._rates["frames"].add(1)
-        exposure_us = round(frame.exposure.total_seconds() * _US_S)
+        exposure_us = frame.exposure // _US
         if self._last_frame_us is not None and self._interval_us > 0:
             n_intervals = round((frame.timestamp - self._last_frame_us) / self._interval_us)
             self._n_frames_lost += max(0, n_intervals - 1)

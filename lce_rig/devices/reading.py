@@ -19,6 +19,11 @@ from lce_rig.io.findings import LIDAR_UTC
 _RATE_WINDOW_S = 3.0
 # Capacity of the queue: two seconds of images, six of scans, longer than the delays of a busy computer.
 _N_SLOTS = 64
+MAX_LOST_SHARE, MAX_OFF_RATE = 0.01, 0.05
+"""Share of lost or damaged data above which a device has a problem, and largest relative error of its rate.
+
+A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
+"""
 READ_WAIT_S = 0.25
 """Longest wait of a driver for data: a source's thread ends no later."""
 REOPEN_EVERY_S = 1.0

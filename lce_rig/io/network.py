@@ -32,6 +32,10 @@ _FRAMES: dict[int, Any] = {
 }
 
 
+# Minimum fraction of a scan's packets or columns that must arrive.
+MIN_COVERAGE = 0.5
+
+
 @dataclass(frozen=True, eq=False)
 class Datagram:
     """One UDP datagram.
@@ -39,13 +43,12 @@ class Datagram:
     Attributes:
         host_ns: arrival at the host; 0 where unknown.
         source: IP address of the sender.
-        source_port, port: UDP ports it was sent from and to.
+        port: UDP port it was sent to.
         payload: content of the datagram.
     """
 
     host_ns: int
     source: str
-    source_port: int
     port: int
     payload: bytes
 
@@ -146,6 +149,4 @@ class PcapFile:
         if not is_whole or not 8 <= udp.ulen <= 8 + len(udp.data):
             self.losses.add(findings.CUT_SHORT())
             return None
-        return Datagram(
-            host_ns, socket.inet_ntoa(ip.src), udp.sport, udp.dport, bytes(udp.data[: udp.ulen - 8])
-        )
+        return Datagram(host_ns, socket.inet_ntoa(ip.src), udp.dport, bytes(udp.data[: udp.ulen - 8]))
