@@ -21,13 +21,13 @@ from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import LiveSource, RateMeter, SourceStatus
+from lce_rig.devices.reading import SILENCE_S, LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
 # Capacity of the queue: batches of 10 ms from three streams for several seconds.
 _N_SLOTS = 2048
-_PAUSE_S, _SILENCE_S = 0.002, 5.0
+_PAUSE_S = 0.002
 _MAX_CLOCK_ERROR_MS = 500.0
 _RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
 _US = timedelta(microseconds=1)
@@ -74,7 +74,7 @@ class DavisSource(LiveSource):
         settings: CameraSettings,
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
     ) -> None:
-        super().__init__(sensor, f"camera {sensor!r}", _SILENCE_S, _SILENT_HINT, _N_SLOTS)
+        super().__init__(sensor, f"camera {sensor!r}", SILENCE_S, _SILENT_HINT, _N_SLOTS)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._opened = OpenedCamera(None, "")

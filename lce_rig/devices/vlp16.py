@@ -17,16 +17,16 @@ from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import MAX_LOST_SHARE, MAX_OFF_RATE, LiveSource, SourceStatus
+from lce_rig.devices.reading import MAX_LOST_SHARE, MAX_OFF_RATE, READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.io.network import Datagram
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
+from lce_rig.timing.clock import NS_PER_S
 
 SILENCE_S = 2.0
 """Longest silence before a LiDAR is lost: 1,500 packets."""
 # Minimum duration of packets that the buffer must hold, s: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
-_WAIT_S = 0.1
 _GATHER_S = 0.005
 
 # Two seconds of data packets, as the kernel accounts for them.
@@ -38,7 +38,6 @@ _MOST_AT_ONCE = 64
 # Socket options of asm-generic/socket.h that Python does not define.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES = 2048, 256
-_NS_PER_S = 1_000_000_000
 _TIMESPEC = struct.Struct("@ll")
 
 
@@ -96,7 +95,7 @@ class Vlp16Source(LiveSource):
         """
         assert self._stream is not None  # it is open
         scans, self._early = self._early, []
-        ready, _, _ = select.select(self._ports, (), (), _WAIT_S)
+        ready, _, _ = select.select(self._ports, (), (), READ_WAIT_S)
         n_before = self._stream.n_data
         try:
             for port in ready:
@@ -268,7 +267,7 @@ class UdpPort:
         for level, kind, data in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
                 seconds, ns = _TIMESPEC.unpack_from(data)
-                host_ns = seconds * _NS_PER_S + ns
+                host_ns = seconds * NS_PER_S + ns
             elif (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
                 (self.n_overflowed,) = struct.unpack_from("@I", data)
         return Datagram(host_ns or time.time_ns(), address, self.port, payload)

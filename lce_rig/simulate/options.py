@@ -59,21 +59,6 @@ class LidarNoise:
             range_step_m=sheet.range_step_m,
         )
 
-    @classmethod
-    def none(cls) -> "LidarNoise":
-        """An infinitely thin beam that measures exactly."""
-        return cls(
-            range_sigma_m=0.0,
-            laser_sigma_m=0.0,
-            dark_bias_m=0.0,
-            weak_bias_m=0.0,
-            divergence_rad=(0.0, 0.0),
-            exit_size_m=(0.0, 0.0),
-            edge_growth_m=0.0,
-            dropout=0.0,
-            is_quantised=False,
-        )
-
 
 @dataclass(frozen=True)
 class CameraNoise:
