@@ -13,11 +13,11 @@ from lce_rig.cli import show
 from lce_rig.cli.contents import put_aside
 from lce_rig.cli.options import (
     cameras_option,
+    names_option,
     path_option,
     require_sensors,
     robot_option,
     session_argument,
-    split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import BY_SCENE, DEFAULT_METHOD, Calibration, Method, Metrics, RigPoses
@@ -83,11 +83,8 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     "Report the error from the T_cam_lidar of this JSON file; the estimate does not use it.",
 )
 @cameras_option
-@click.option(
-    "--channels",
-    callback=split_names,
-    metavar="NAME[,NAME]",
-    help="Use only these channels, such as frames or events [default: all, in one joint estimate].",
+@names_option(
+    "--channels", "Use only these channels, such as frames or events [default: all, in one joint estimate]."
 )
 @click.option(
     "--method",
@@ -103,11 +100,10 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
 )
 @robot_option
-@click.option(
+@names_option(
     "--without",
-    callback=split_names,
-    metavar="CAPTURE[,CAPTURE]",
-    help="Reject these captures first, like `captures --reject`; `captures --restore` brings them back.",
+    "Reject these captures first, like `captures --reject`; `captures --restore` brings them back.",
+    "CAPTURE[,CAPTURE]",
 )
 @click.option(
     "--rig",

@@ -127,25 +127,26 @@ def _record(pose: PoseDetection, surfaces: SurfaceDetection, refusal: Refusal | 
     }
 
 
-# Heading and unit, sensor, figure, scale to the unit, digits.
-Column = tuple[str, str, str, float, int]
+# Heading and unit, sensor, figure in SI units, digits.
+Column = tuple[str, str, str, int]
+_PER_UNIT = {"mm": 1000, "cm/s": 100}
 _IMAGE: tuple[Column, ...] = (
-    ("dist\nm", "image", "distance_m", 1.0, 2),
-    ("tilt\ndeg", "image", "tilt_deg", 1.0, 0),
-    ("corner\npx", "image", "corner_rms_px", 1.0, 2),
-    ("sharp", "image", "sharpness", 1.0, 1),
+    ("dist\nm", "image", "distance_m", 2),
+    ("tilt\ndeg", "image", "tilt_deg", 0),
+    ("corner\npx", "image", "corner_rms_px", 2),
+    ("sharp", "image", "sharpness", 1),
 )
 _EVENTS: tuple[Column, ...] = (
-    ("events\npx/s", "image", "events_px_s", 1.0, 1),
-    ("speed\ncm/s", "image", "speed_mps", 100.0, 0),
+    ("events\npx/s", "image", "events_px_s", 1),
+    ("speed\ncm/s", "image", "speed_mps", 0),
 )
-_POINTS: tuple[Column, ...] = (("points", "lidar", "n_points", 1.0, 0),)
+_POINTS: tuple[Column, ...] = (("points", "lidar", "n_points", 0),)
 _LIDAR: tuple[Column, ...] = (
-    ("rings", "lidar", "n_rings", 1.0, 0),
-    ("plane\nmm", "lidar", "plane_rms_m", 1000.0, 1),
-    ("wide\nm", "lidar", "width_m", 1.0, 3),
-    ("high\nm", "lidar", "height_m", 1.0, 3),
-    ("edges\nmm", "lidar", "edge_rms_m", 1000.0, 1),
+    ("rings", "lidar", "n_rings", 0),
+    ("plane\nmm", "lidar", "plane_rms_m", 1),
+    ("wide\nm", "lidar", "width_m", 3),
+    ("high\nm", "lidar", "height_m", 3),
+    ("edges\nmm", "lidar", "edge_rms_m", 1),
 )
 # A side without ring ends has a larger standard deviation; its length is the profile's, not a measurement.
 _SIDE_SIGMA_MAX_M = 0.05
@@ -160,8 +161,8 @@ def _table(detections: Detections, pair: Pair, records: Mapping[str, dict[str, A
     rows = []
     for name, record in records.items():
         cells = []
-        for _, sensor, key, scale, digits in columns:
-            figures = record[sensor] or {}
+        for heading, sensor, key, digits in columns:
+            figures, scale = record[sensor] or {}, _PER_UNIT.get(heading.partition("\n")[2], 1)
             sigma_m = figures.get(f"{key.removesuffix('_m')}_sigma_m") or 0.0
             value = None if sigma_m > _SIDE_SIGMA_MAX_M else figures.get(key)
             cells.append("-" if value is None else f"{scale * value:.{digits}f}")

@@ -14,7 +14,6 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedEr
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import open_live
-from lce_rig.judge.board_drift import BoardDrift
 from lce_rig.pipeline.pair_drift import DriftReport, PairDrift
 from lce_rig.pipeline.verification import profile_behind
 from lce_rig.pipeline.watch_drift import drift as watch_drift
@@ -130,12 +129,8 @@ def _parts(pair: PairDrift) -> Iterator[Any]:
     for finding in (*pair.contradictions, *pair.drift.findings):
         yield f"  {show.escape(as_line(finding.text))}"
     if pair.board is not None:
-        yield f"  {show.escape(as_line(_of_boards(pair.board)))}"
+        opinion = f"{show.counted(pair.board.n_boards, 'board')}: {STATES[pair.board.state]}"
+        # The first finding; unobservable directions come last.
+        yield f"  {show.escape(as_line(f'{opinion}; {pair.board.findings[0].text}'))}"
     if pair.advice:
         yield f"  -> {show.escape(as_line(pair.advice))}"
-
-
-def _of_boards(board: BoardDrift) -> str:
-    """Return the first finding from the boards, unobservable directions last."""
-    opinion = f"{show.counted(board.n_boards, 'board')}: {STATES[board.state]}"
-    return f"{opinion}; {board.findings[0].text}"

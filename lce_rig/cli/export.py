@@ -7,7 +7,7 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.options import path_option, result_option, session_argument, split_names
+from lce_rig.cli.options import names_option, path_option, result_option, session_argument
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.export import EXPORTS, USUAL, load_exporter, require_usable
@@ -28,12 +28,11 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
 @click.command()
 @session_argument
 @result_option("Export")
-@click.option(
+@names_option(
     "--formats",
-    callback=split_names,
-    metavar="LIST",
-    help="Write only these formats, separated by commas [default: the profile's `exports`, else those marked "
+    "Write only these formats, separated by commas [default: the profile's `exports`, else those marked "
     "in --list].",
+    "LIST",
 )
 @click.option(
     "--list",

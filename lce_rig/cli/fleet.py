@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option, path_option, registry_option, split_names
+from lce_rig.cli.options import FiniteRange, json_option, names_option, path_option, registry_option
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.interrupts import patience
@@ -152,12 +152,7 @@ def run(
     metavar="CONDITION",
     help="Choose rows by a condition in SQL, such as \"verdict = 'fail' and date > '2026-01-01'\".",
 )
-@click.option(
-    "--columns",
-    callback=split_names,
-    metavar="NAME[,NAME]",
-    help="Choose columns [default: all with --json, else the most important].",
-)
+@names_option("--columns", "Choose columns [default: all with --json, else the most important].")
 @json_option
 @click.option("--rebuild", is_flag=True, help="Rebuild the table from all results' folders first.")
 def table(registry: str, where: str, columns: list[str] | None, as_json: bool, rebuild: bool) -> None:

@@ -12,13 +12,14 @@ from lce_rig.cli.options import (
     cameras_option,
     explain_option,
     json_option,
+    names_option,
     path_option,
     require_sensors,
     session_argument,
-    split_names,
 )
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.phrasing import as_line
+from lce_rig.lens.models import MODELS
 from lce_rig.pipeline.camera_intrinsics import (
     MeasuredIntrinsics,
     document,
@@ -29,21 +30,16 @@ from lce_rig.pipeline.camera_intrinsics import save_profile as write_profile
 from lce_rig.pipeline.measure_lidar import lidar_document, measure_lidar, save_lidar
 from lce_rig.session import Session
 
-_MODELS = ("radtan4", "radtan5", "rational", "equidistant")
-
 
 @click.command()
 @session_argument
 @cameras_option
-@click.option(
-    "--channels",
-    callback=split_names,
-    metavar="NAME[,NAME]",
-    help="Use these channels together, as they share the lens [default: those of kind frames].",
+@names_option(
+    "--channels", "Use these channels together, as they share the lens [default: those of kind frames]."
 )
 @click.option(
     "--model",
-    type=click.Choice(_MODELS),
+    type=click.Choice(list(MODELS)),
     help="Set the lens model [default: the profile's].",
 )
 @path_option(
@@ -173,11 +169,11 @@ def lidar_intrinsics(
         show.note(f"written: {save_profile}")
 
 
-# Name, keys of a laser's row, scale to the printed unit, digits, unit.
+# Name, keys of a laser's row, factor to the printed unit, digits, unit.
 _ERRORS = (
-    ("range", "range_m", "range_sigma_m", 1000.0, 1, "mm"),
-    ("azimuth", "azimuth_deg", "azimuth_sigma_deg", 1.0, 3, "deg"),
-    ("elevation", "elevation_deg", "elevation_sigma_deg", 1.0, 3, "deg"),
+    ("range", "range_m", "range_sigma_m", 1000, 1, "mm"),
+    ("azimuth", "azimuth_deg", "azimuth_sigma_deg", 1, 3, "deg"),
+    ("elevation", "elevation_deg", "elevation_sigma_deg", 1, 3, "deg"),
 )
 
 

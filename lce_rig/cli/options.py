@@ -21,9 +21,13 @@ class FiniteRange(click.FloatRange):
         return number
 
 
-def split_names(_ctx: click.Context, _param: click.Parameter, value: str | None) -> list[str] | None:
-    """Split names separated by commas, as an option's callback."""
-    return None if value is None else [name.strip() for name in value.split(",")]
+def names_option(name: str, text: str, metavar: str = "NAME[,NAME]") -> Callable[[_Verb], _Verb]:
+    """Declare an option whose value is a list of names separated by commas."""
+
+    def split(_ctx: click.Context, _param: click.Parameter, value: str | None) -> list[str] | None:
+        return None if value is None else [part.strip() for part in value.split(",")]
+
+    return click.option(name, callback=split, metavar=metavar, help=text)
 
 
 def path_option(

@@ -12,7 +12,6 @@ import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
-from types import TracebackType
 from typing import Any
 
 from lce_rig.core.errors import LceRigError, SourceError
@@ -48,9 +47,7 @@ class Worker:
         self._start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the process at once; a pending call raises SourceError."""
         # A call waiting in another thread clears the process at its end.
         self._is_closed, process = True, self._process

@@ -15,6 +15,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
+SIGMA_PER_MAD = 1.4826
+"""Standard deviation of normal noise over its median magnitude."""
+EVEN_STEPS = (1 / 1.2207440846057596) ** np.arange(1, 4)
+"""Steps whose multiples, modulo 1, fill a unit cube and each of its axes evenly: powers of 1/g, g^4 = g + 1.
+
+M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
+"""
 # Degrees of freedom of the Student distribution that weights poses, as some may be outliers.
 _STUDENT = 5.0
 # 99 % of the chi-squared distribution with six degrees of freedom.
@@ -95,6 +102,10 @@ def pose(R: Array, t: Array) -> Array:
     T = np.zeros((*shape, 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T
+
+
+T_BODY_OPTICAL = pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+"""REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own."""
 
 
 def parse_pose(value: Any, rounding: float = 1e-6) -> Array:

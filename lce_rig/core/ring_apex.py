@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.geometry import Array, exp_so3
+from lce_rig.core.geometry import SIGMA_PER_MAD, Array, exp_so3
 
 # Noise of a return's elevation: of the beam's angle, rad, and of its origin in the sensor, m.
 _SIGMA_RAD, _SIGMA_M = np.radians(0.1), 0.01
@@ -86,7 +86,7 @@ def find_apex(points: NDArray[np.float32], ring: NDArray[np.int16]) -> Apex | No
         elevation = np.arctan2(local[:, 2], flat_m)
         scaled = _about_means(elevation, laser, soft / sigma**2) / sigma
         if step >= _PLAIN_STEPS:
-            spread = max(1.4826 * float(np.median(np.abs(scaled))), 1e-6)
+            spread = max(SIGMA_PER_MAD * float(np.median(np.abs(scaled))), 1e-6)
             soft = np.minimum(1.0, _HUBER * spread / np.maximum(np.abs(scaled), 1e-12))
         weight = soft / sigma**2
         error, J = _about_means(elevation, laser, weight), _about_means(J, laser, weight)

@@ -21,16 +21,15 @@ from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import LiveSource, RateMeter, SourceStatus
+from lce_rig.devices.reading import SILENCE_S, LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
 # Capacity of the queue: batches of 10 ms from three streams for several seconds.
 _N_SLOTS = 2048
-_PAUSE_S, _SILENCE_S = 0.002, 5.0
+_PAUSE_S = 0.002
 _MAX_CLOCK_ERROR_MS = 500.0
 _RISING = "EXTERNAL_SIGNAL_RISING_EDGE"
-_US_S = 1e6
 _US = timedelta(microseconds=1)
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
 _OTHER_MODEL = "Check driver.device and resolution_px: it may be another model."
@@ -75,7 +74,7 @@ class DavisSource(LiveSource):
         settings: CameraSettings,
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
     ) -> None:
-        super().__init__(sensor, f"camera {sensor!r}", _SILENCE_S, _SILENT_HINT, _N_SLOTS)
+        super().__init__(sensor, f"camera {sensor!r}", SILENCE_S, _SILENT_HINT, _N_SLOTS)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._opened = OpenedCamera(None, "")
@@ -173,7 +172,7 @@ class DavisSource(LiveSource):
         if pixels.shape[1::-1] != self._settings.resolution_px:
             raise self._wrong_size(f"frames of {pixels.shape[1]}x{pixels.shape[0]} px")
         self._rates["frames"].add(1)
-        exposure_us = round(frame.exposure.total_seconds() * _US_S)
+        exposure_us = frame.exposure // _US
         if self._last_frame_us is not None and self._interval_us > 0:
             n_intervals = round((frame.timestamp - self._last_frame_us) / self._interval_us)
             self._n_frames_lost += max(0, n_intervals - 1)

@@ -4,7 +4,6 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Generic, TypeVar
 
 from lce_rig.core.errors import LceRigError, SessionError
@@ -58,9 +57,7 @@ class DiskWriter(Generic[T]):
     def __enter__(self) -> "DiskWriter[T]":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

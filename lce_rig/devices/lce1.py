@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
+from lce_rig.devices.reading import MAX_LOST_SHARE
 from lce_rig.rig.profile import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S
 from lce_rig.timing.clock_fit import ClockTracker
@@ -180,7 +181,6 @@ _MAX_ROUND_TRIP_NS = 2 * NS_PER_S
 # Largest step back of the board's time between messages out of order; a larger one is a restart.
 _MOST_BACK_NS = NS_PER_S
 _STALLED_S = 3.0
-_DAMAGED = 0.01
 _MIN_DAMAGED = 5
 _PPS_LATE_S = 2.5
 _NO_CLOCK_S = 5.0
@@ -312,7 +312,7 @@ class BoardState:
         problems: list[Finding] = []
         n_damaged = self.reader.n_damaged
         n_lines = n_damaged + self.reader.n_messages
-        if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
+        if n_damaged >= _MIN_DAMAGED and n_damaged > MAX_LOST_SHARE * n_lines:
             problems.append(findings.DAMAGED_LINES(n=n_damaged, n_lines=n_lines))
         if self.restarted_ns is not None:
             ago_s = (now_ns - self.restarted_ns) / NS_PER_S

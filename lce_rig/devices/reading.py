@@ -7,7 +7,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import TracebackType
 from typing import Generic, TypeVar
 
 from lce_rig.core.data import LiveSample
@@ -19,6 +18,13 @@ from lce_rig.io.findings import LIDAR_UTC
 _RATE_WINDOW_S = 3.0
 # Capacity of the queue: two seconds of images, six of scans, longer than the delays of a busy computer.
 _N_SLOTS = 64
+MAX_LOST_SHARE, MAX_OFF_RATE = 0.01, 0.05
+"""Share of lost or damaged data above which a device has a problem, and largest relative error of its rate.
+
+A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
+"""
+SILENCE_S = 5.0
+"""Longest silence before a camera counts as lost."""
 READ_WAIT_S = 0.25
 """Longest wait of a driver for data: a source's thread ends no later."""
 REOPEN_EVERY_S = 1.0
@@ -351,9 +357,7 @@ class AttachedSensors:
         self._inbox.n_dropped.clear()  # Samples dropped while other sensors were being opened do not count.
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close every sensor."""
         self.stop()
         self._inbox.close()

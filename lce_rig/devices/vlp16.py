@@ -17,18 +17,16 @@ from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.reading import MAX_LOST_SHARE, MAX_OFF_RATE, READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.io.network import Datagram
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
+from lce_rig.timing.clock import NS_PER_S
 
 SILENCE_S = 2.0
 """Longest silence before a LiDAR is lost: 1,500 packets."""
 # Minimum duration of packets that the buffer must hold, s: the longest pause of a fast enough computer.
 _MIN_BUFFER_S = 0.25
-_MAX_LOST_SHARE = 0.01
-_MAX_OFF_RATE = 0.05
-_WAIT_S = 0.1
 _GATHER_S = 0.005
 
 # Two seconds of data packets, as the kernel accounts for them.
@@ -40,7 +38,6 @@ _MOST_AT_ONCE = 64
 # Socket options of asm-generic/socket.h that Python does not define.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES = 2048, 256
-_NS_PER_S = 1_000_000_000
 _TIMESPEC = struct.Struct("@ll")
 
 
@@ -98,7 +95,7 @@ class Vlp16Source(LiveSource):
         """
         assert self._stream is not None  # it is open
         scans, self._early = self._early, []
-        ready, _, _ = select.select(self._ports, (), (), _WAIT_S)
+        ready, _, _ = select.select(self._ports, (), (), READ_WAIT_S)
         n_before = self._stream.n_data
         try:
             for port in ready:
@@ -184,7 +181,7 @@ class Vlp16Source(LiveSource):
         n_overflowed = sum(port.n_overflowed for port in ports)
         granted_bytes = min((port.granted_bytes for port in ports), default=0)
         n_lost_on_way = stream.losses.n("packet.lost") - n_overflowed
-        if n_lost_on_way > _MAX_LOST_SHARE * max(stream.n_data, 1):
+        if n_lost_on_way > MAX_LOST_SHARE * max(stream.n_data, 1):
             problems.append(findings.PACKETS_LOST(share=n_lost_on_way / (stream.n_data + n_lost_on_way)))
         if n_overflowed:
             problems.append(findings.COMPUTER_TOO_SLOW(n=n_overflowed, buffer_kib=granted_bytes // 2048))
@@ -192,9 +189,9 @@ class Vlp16Source(LiveSource):
         buffer_s = granted_bytes / _PACKET_COST_BYTES * packet_s
         if 0 < buffer_s < _MIN_BUFFER_S:
             problems.append(findings.BUFFER_SMALL(buffer_s=buffer_s, buffer_kib=granted_bytes // 2048))
-        problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * stream.n_data]
+        problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > MAX_LOST_SHARE * stream.n_data]
         rotor_hz, rate_hz = stream.rotor_hz, self._settings.rate_hz
-        if rotor_hz and abs(rotor_hz / rate_hz - 1) > _MAX_OFF_RATE:
+        if rotor_hz and abs(rotor_hz / rate_hz - 1) > MAX_OFF_RATE:
             rotor = findings.ROTOR_RATE(rotor_hz=rotor_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
             problems.append(rotor)
         return problems
@@ -263,14 +260,14 @@ class UdpPort:
         self._socket.close()
 
     def _receive(self) -> Datagram:
-        payload, ancillary, _, (address, port) = self._socket.recvmsg(
+        payload, ancillary, _, (address, _) = self._socket.recvmsg(
             _MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES, socket.MSG_DONTWAIT
         )
         host_ns = 0
         for level, kind, data in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
                 seconds, ns = _TIMESPEC.unpack_from(data)
-                host_ns = seconds * _NS_PER_S + ns
+                host_ns = seconds * NS_PER_S + ns
             elif (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
                 (self.n_overflowed,) = struct.unpack_from("@I", data)
-        return Datagram(host_ns or time.time_ns(), address, port, self.port, payload)
+        return Datagram(host_ns or time.time_ns(), address, self.port, payload)

@@ -20,9 +20,10 @@ import numpy as np
 from lce_rig.core.data import Image, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity, worst
+from lce_rig.core.geometry import SIGMA_PER_MAD
 from lce_rig.devices import sensors, source_of
 from lce_rig.devices.findings import BOARD_NOT_TIED
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import MAX_LOST_SHARE, MAX_OFF_RATE, LiveSource
 from lce_rig.doctor import findings
 from lce_rig.doctor.observing import Examination, ObservedSensor, observe
 from lce_rig.rig import Rig
@@ -35,12 +36,9 @@ _MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
 _MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
 # struct timex is 26 longs on 64-bit Linux; its fourth is the largest error, us.
 _TIMEX_LONGS, _MAX_ERROR_LONG, _TIME_ERROR = 32, 3, 5
-# A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
-_MAX_OFF_RATE, _MAX_OFF_PULSES = 0.05, 0.02
-_MAX_LOST_SHARE = 0.01
+# Largest relative error of the rate of the sync board's pulses.
+_MAX_OFF_PULSES = 0.02
 _STOPPED_S = 1.0
-_US_PER_S = 1e6
-_SIGMA_PER_MAD = 1.4826
 # Tolerance on the counts of frames and pulses, absolute and relative: both arrive in bursts.
 _ROOM, _MAX_UNLIKE = 2, 0.01
 
@@ -124,7 +122,7 @@ def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
     if n_missing:
         n_came = len(seen.arrivals_ns.get(stream, ())) if status.n_packets is None else status.n_packets
         counts["share"] = share = n_missing / (max(n_came, 1) + status.n_lost)
-        severity: Severity = "error" if share > _MAX_LOST_SHARE else "warning"
+        severity: Severity = "error" if share > MAX_LOST_SHARE else "warning"
         yield findings.LOSSES(**counts, severity=severity, action="named" if problems else "")
     else:
         yield findings.COMPLETE(**counts)
@@ -139,7 +137,7 @@ def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
     # Pulses cannot trigger a DAVIS, which has its own frame interval.
     if driver == "davis":
         interval_us = settings.controls.get("frame_interval_us", 0)
-        return _US_PER_S / interval_us if isinstance(interval_us, int | float) and interval_us > 0 else None
+        return 1e6 / interval_us if isinstance(interval_us, int | float) and interval_us > 0 else None
     if rig.sync is not None and sensor in rig.sync.triggers:
         return rig.sync.triggers[sensor].rate_hz
     return settings.frame_rate_hz
@@ -162,7 +160,7 @@ def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
     silent_s = (seen.ended_ns - seen.arrivals_ns[stream][-1]) * 1e-9
     if silent_s > max(_STOPPED_S, 3 / rate_hz):
         return findings.STOPPED(**figures, silent_s=silent_s)
-    if expected_hz is None or abs(rate_hz / expected_hz - 1) <= _MAX_OFF_RATE:
+    if expected_hz is None or abs(rate_hz / expected_hz - 1) <= MAX_OFF_RATE:
         return findings.RATE(**figures)
     is_triggered = exam.rig.sync is not None and seen.sensor in exam.rig.sync.triggers
     action = "rotor" if stream == "scans" else "trigger" if is_triggered else ""
@@ -245,7 +243,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
             delays_ms.append(((matched.image.stamp_ns or 0) - clock.convert(matched.pulse_ns)) * 1e-6)
     if delays_ms:
         middle_ms = float(np.median(delays_ms))
-        scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(np.array(delays_ms) - middle_ms)))
+        scatter_ms = SIGMA_PER_MAD * float(np.median(np.abs(np.array(delays_ms) - middle_ms)))
         yield findings.DELAY(delay_ms=middle_ms, delay_scatter_ms=scatter_ms)
     if matcher.problem is not None:
         yield matcher.problem

@@ -15,8 +15,7 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError
-from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
-from lce_rig.export.writing import T_BODY_OPTICAL
+from lce_rig.core.geometry import T_BODY_OPTICAL, Array, difference, invert, tangent_sizes
 from lce_rig.rig import CameraSettings, Rig
 
 

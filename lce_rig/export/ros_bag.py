@@ -22,12 +22,13 @@ from lce_rig.export.writing import quaternion_xyzw
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
 from lce_rig.io.ros.messages import typestore
 from lce_rig.show.overlays.overlay import draw_projection, range_limits
+from lce_rig.timing.clock import NS_PER_S
 
 _TF_TYPE, _TF_STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
 _INFO_TYPE, _JPEG_TYPE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 92
 # Interval between captures without timestamps, ns.
-_STEP_NS = _NS_PER_S = 10**9
+_STEP_NS = NS_PER_S
 
 
 class _Topics:
@@ -207,7 +208,7 @@ def _write_tf_static(writer: Any, job: ExportJob, stamp_ns: int) -> None:
 def _ros_header(stamp_ns: int, frame_id: str) -> Any:
     """Build a std_msgs/Header."""
     types = typestore(False).types
-    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
 

@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.errors import ResultRefusedError
-from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.core.geometry import Array, project_to_so3
 from lce_rig.rig.loading import dump_yaml
-
-# REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own.
-R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-T_BODY_OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
 
 
 def number(value: float) -> str:

@@ -59,10 +59,13 @@ from lce_rig.fleet.releases import (
 from lce_rig.fleet.target import TargetSettings
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
+from lce_rig.rig.profile import NominalExtrinsic
 from lce_rig.session import Session
 
 # Largest accepted movement of pairs without a tolerance in the profile: defaults of `nominal_extrinsics`.
-_TOLERANCE_DEG, _TOLERANCE_M = 5.0, 0.1
+_TOLERANCE_DEG, _TOLERANCE_M = (
+    NominalExtrinsic.model_fields[name].default for name in ("tolerance_deg", "tolerance_m")
+)
 _OTHER = "Another deployment came first. Run the same command again."
 
 

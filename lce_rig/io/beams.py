@@ -9,11 +9,10 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import DATA_SHEETS, DataSheet, find_data_sheet
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
+from lce_rig.io.cloud import HEIGHT_PRIOR
 from lce_rig.io.findings import BEAMS_OF_OTHER_MODEL, POINTS_SKIPPED, RINGS_SKIPPED
 from lce_rig.rig import LidarSettings
 
-# Prior of a ring's height, which one distance does not determine: 0.1 mrad against 15 mm.
-_HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
 # Largest rms deviation of one unit's elevations from its model's, deg: two Ousters have 0.3 and 0.6, other
 # models of as many rings at least 2.
 _MAX_OF_UNIT_DEG = 1.0
@@ -57,7 +56,7 @@ def measure_elevations(scan: Scan) -> Array:
         # Fit twice: returns of foreign rings and of edges are few, but far off.
         for _ in range(2):
             dx, dy = x[mine] - x[mine].mean(), y[mine] - y[mine].mean()
-            height_m = float(np.clip((dx @ dy) / (dx @ dx + _HEIGHT_PRIOR * mine.sum()), -0.05, 0.05))
+            height_m = float(np.clip((dx @ dy) / (dx @ dx + HEIGHT_PRIOR * mine.sum()), -0.05, 0.05))
             slope = float(np.median(y[mine] - height_m * x[mine]))
             mine = mine & (np.abs(y - height_m * x - slope) < 0.01)
             if not mine.any():

@@ -111,7 +111,8 @@ class CameraDescription:
         (x, y), (across, down) = offset_px, binning
         notes += [f"binning {across}x{down} applied"] if binning != (1, 1) else []
         notes += [f"roi at {x}, {y} px applied"] if any(offset_px) else []
-        if self._is_windowed and not any(offset_px) and binning == (1, 1):
+        is_windowed = self.binning != (1, 1) or any(self.roi_px[:2])
+        if is_windowed and not any(offset_px) and binning == (1, 1):
             notes.append("its binning and roi are not those of the images, which have the full size")
         read = replace(
             lens,
@@ -126,10 +127,6 @@ class CameraDescription:
         if image_px is not None and not _fits(size_px, image_px):
             raise ValueError(_other_size(read, image_px))
         return read, notes
-
-    @property
-    def _is_windowed(self) -> bool:
-        return self.binning != (1, 1) or any(self.roi_px[:2])
 
     def _readout(
         self, image_px: tuple[int, int] | None

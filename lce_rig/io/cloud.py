@@ -15,6 +15,8 @@ from lce_rig.rig import LidarSettings
 BIN_RAD = np.radians(0.02)
 MAX_RINGS = 256
 MAX_OFFSET_M = 0.015
+# Prior of a ring's height, which one distance does not determine: 0.1 mrad against 15 mm.
+HEIGHT_PRIOR = (1e-4 / MAX_OFFSET_M) ** 2
 
 INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
 RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
@@ -126,10 +128,7 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
         count = np.maximum(np.bincount(ring, minlength=n), 1)
         mean_x, mean_y = np.bincount(ring, x, n) / count, np.bincount(ring, y, n) / count
         dx, dy = x - mean_x[ring], y - mean_y[ring]
-        # A prior keeps the offset near zero for a ring with returns at a single distance (0.1 mrad against 15
-        # mm).
-        prior = (1e-4 / MAX_OFFSET_M) ** 2 * count
-        offset = np.bincount(ring, dx * dy, n) / (np.bincount(ring, dx * dx, n) + prior)
+        offset = np.bincount(ring, dx * dy, n) / (np.bincount(ring, dx * dx, n) + HEIGHT_PRIOR * count)
         offset = np.clip(offset, -MAX_OFFSET_M, MAX_OFFSET_M)
         refined = np.stack([mean_y - offset * mean_x, offset], axis=1)
         is_seen = np.bincount(ring, minlength=n) > 0

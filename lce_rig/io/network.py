@@ -15,8 +15,8 @@ from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.rig import DriverSettings
+from lce_rig.timing.clock import NS_PER_S
 
-_NS_PER_S = 1_000_000_000
 FRAME_BYTES = 58
 """Bytes of a recorded datagram besides its payload: headers of pcap, Ethernet, IP and UDP."""
 # Packets read to find a recording's sensors (1 s or less of one sensor); reasons listed in an error.
@@ -30,6 +30,8 @@ _FRAMES: dict[int, Any] = {
     113: dpkt.sll.SLL,
     276: dpkt.sll2.SLL2,
 }
+# Minimum fraction of a scan's packets or columns that must arrive.
+MIN_COVERAGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +41,12 @@ class Datagram:
     Attributes:
         host_ns: arrival at the host; 0 where unknown.
         source: IP address of the sender.
-        source_port, port: UDP ports it was sent from and to.
+        port: UDP port it was sent to.
         payload: content of the datagram.
     """
 
     host_ns: int
     source: str
-    source_port: int
     port: int
     payload: bytes
 
@@ -85,7 +86,7 @@ class PcapFile:
                 for stamp_s, raw in dpkt.pcap.UniversalReader(file):
                     # dpkt returns timestamps of ns as exact decimals, others as floats with 1 us resolution.
                     is_exact = isinstance(stamp_s, Decimal)
-                    host_ns = int(stamp_s * _NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
+                    host_ns = int(stamp_s * NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
                     datagram = self._read(raw, host_ns)
                     if datagram is not None:
                         yield datagram
@@ -146,6 +147,4 @@ class PcapFile:
         if not is_whole or not 8 <= udp.ulen <= 8 + len(udp.data):
             self.losses.add(findings.CUT_SHORT())
             return None
-        return Datagram(
-            host_ns, socket.inet_ntoa(ip.src), udp.sport, udp.dport, bytes(udp.data[: udp.ulen - 8])
-        )
+        return Datagram(host_ns, socket.inet_ntoa(ip.src), udp.dport, bytes(udp.data[: udp.ulen - 8]))

@@ -19,12 +19,9 @@ from lce_rig.core.files import read_json
 from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
 from lce_rig.io import findings
-from lce_rig.io.network import FRAME_BYTES, PcapFile
+from lce_rig.io.network import FRAME_BYTES, MIN_COVERAGE, PcapFile
 from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
-
-# Minimum fraction of a scan's columns that must arrive.
-_MIN_COVERAGE = 0.5
 
 
 class Profile(NamedTuple):
@@ -256,7 +253,7 @@ class OusterRecording:
         columns = packets["columns"].reshape(-1)
         number = columns["column"].astype(np.int64)
         columns = columns[(columns["status"] & 1 == 1) & (number < metadata.n_columns)]
-        if len(columns) < _MIN_COVERAGE * metadata.n_columns:
+        if len(columns) < MIN_COVERAGE * metadata.n_columns:
             return None
         pixels = columns["pixels"]
         range_m = (pixels["range"].astype(np.int64) & metadata.profile.range_mask) * metadata.profile.unit_m

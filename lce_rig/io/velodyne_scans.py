@@ -20,7 +20,7 @@ from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
-from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
+from lce_rig.io.network import FRAME_BYTES, MIN_COVERAGE, Datagram, PcapFile
 from lce_rig.io.recording import SourceOptions, choose_lidar, fingerprint, follows
 from lce_rig.io.velodyne_packets import (
     BadPacketError,
@@ -39,8 +39,6 @@ _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "
 # Number of packets ahead that are accepted without the host's clock; above it, both clocks must agree.
 _MAX_BLIND = 4
 _MAX_DISAGREEMENT_NS = 20_000_000
-# Minimum fraction of a scan's packets that must arrive.
-_MIN_COVERAGE = 0.5
 
 
 def read_controls(sensor: str, settings: LidarSettings) -> tuple[int, float]:
@@ -251,7 +249,7 @@ class Vlp16Stream:
         n_blocks = sum(piece.blocks.stop - piece.blocks.start for piece in pieces)
         packet = pieces[-1].packet
         n_turn = velodyne.AZIMUTH_STEPS / (packet.steps_per_ns * self.product.block_ns)
-        if n_blocks < _MIN_COVERAGE * n_turn * (1 + packet.is_dual):
+        if n_blocks < MIN_COVERAGE * n_turn * (1 + packet.is_dual):
             self.losses.add(findings.SCAN_THIN())
             return None
         packets = np.array([piece.packet.fields for piece in pieces], velodyne.DATA_PACKET)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lce_rig.core.calibration import Calibration, RigPoses, SceneOpinion
-from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import T_BODY_OPTICAL, Array, invert, perturb, sigma_sizes, tangent_sizes
 from lce_rig.core.phrasing import sizes
-from lce_rig.export.writing import T_BODY_OPTICAL, rpy
+from lce_rig.export.writing import rpy
 from lce_rig.judge.findings import cause_words
 
 Row = Sequence[str]

@@ -13,10 +13,9 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Hits, Raycaster, surface_colour
+from lce_rig.simulate.surfaces import ROOM
 
-#: Linear (blue, green, red) of light that comes from everywhere, and of one lamp at 1 m.
-_AMBIENT = np.array([0.400, 0.395, 0.385])
-_LAMP = np.array([1.50, 1.58, 1.62])
+_AMBIENT, _LAMP = (np.array(ROOM["light"][name]) for name in ("ambient", "lamp"))
 
 
 def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:

@@ -124,13 +124,9 @@ def _look_through(
 
 def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Grow a mask (H, W) by one pixel, diagonals included."""
-    down = mask.copy()
-    down[1:] |= mask[:-1]
-    down[:-1] |= mask[1:]
-    out = down.copy()
-    out[:, 1:] |= down[:, :-1]
-    out[:, :-1] |= down[:, 1:]
-    return np.asarray(out)
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:

@@ -1,22 +1,17 @@
 """Options of a simulated rig; defaults come from data sheets and real recordings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
 from lce_rig.core.data_sheets import VLP_16, DataSheet
 from lce_rig.core.geometry import Array
-from lce_rig.simulate.surfaces import Material, Mesh
+from lce_rig.simulate.surfaces import Mesh
 
 Carrier = Literal["stand", "person", "none"]
 Motion = Literal["still", "moving"]
-Part = tuple[str, Mesh, Material, Array]
-"""Name, mesh in the room's frame, material and T_room_part (4, 4) of a body."""
-Obstacles = Sequence[tuple[Array, Array]]
-"""(low, high) corners, m, frame room."""
-Furnish = Callable[[Array, Array, np.random.Generator], tuple[Array, Array, list[Part], Obstacles]]
+Part = tuple[str, Mesh, str, Array]
+"""Name, mesh in the room's frame, name of the material and T_room_part (4, 4) of a body."""
 
 
 @dataclass(frozen=True)
@@ -62,21 +57,6 @@ class LidarNoise:
             divergence_rad=sheet.divergence_rad,
             exit_size_m=sheet.exit_m,
             range_step_m=sheet.range_step_m,
-        )
-
-    @classmethod
-    def none(cls) -> "LidarNoise":
-        """An infinitely thin beam that measures exactly."""
-        return cls(
-            range_sigma_m=0.0,
-            laser_sigma_m=0.0,
-            dark_bias_m=0.0,
-            weak_bias_m=0.0,
-            divergence_rad=(0.0, 0.0),
-            exit_size_m=(0.0, 0.0),
-            edge_growth_m=0.0,
-            dropout=0.0,
-            is_quantised=False,
         )
 
 
@@ -156,7 +136,7 @@ class SimulationOptions:
         distance_m: range of the board's distance from the camera; no board is placed where the LiDAR would
             see less than four fifths of the plate (a diamond of 1 m nearer than about 1.4 m).
         roll_deg: mean and half-width of the board's rotation in its plane, 0 = upright, 45 = a diamond.
-        furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
+        decoys: bodies instead of the room's furniture; None keeps the furniture.
         truth_rotation_deg, truth_translation_m: maximum distance of the true extrinsics from the profile's
             nominal ones; never more than 0.8 of the profile's tolerances.
         mounting_seed: seed of true extrinsics and sensor errors; None for the session's seed.
@@ -176,7 +156,7 @@ class SimulationOptions:
     camera: CameraNoise = field(default_factory=CameraNoise)
     distance_m: tuple[float, float] = (1.2, 4.0)
     roll_deg: tuple[float, float] = (45.0, 15.0)
-    furnish: Furnish | None = None
+    decoys: Sequence[Part] | None = None
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02
     mounting_seed: int | None = None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, exp_so3, invert, log_so3, perturb, pose, transform
+from lce_rig.core.geometry import EVEN_STEPS, Array, exp_so3, invert, log_so3, perturb, pose, transform
 from lce_rig.simulate.backdrop import lens_reach
 from lce_rig.simulate.lidar import LidarModel
 from lce_rig.simulate.options import HandMotion, SimulationOptions
@@ -24,9 +24,6 @@ _WANTED_RINGS = 7
 _FEWEST_RINGS = 4
 _RETURNS_PER_RING = 6
 _WANTED_SHARE = 0.8
-# Powers of 1/g with g^4 = g + 1: each column's multiples fill 0..1 evenly, and so do all three together.
-# M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
-_SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +144,7 @@ def place_board(
     fallback, most_rings = None, 0
     for attempt in range(_ATTEMPTS):
         # The first tries keep near the even filling, later ones go anywhere.
-        even = np.mod(start + (index + 1) * _SPREAD, 1.0)
+        even = np.mod(start + (index + 1) * EVEN_STEPS, 1.0)
         wander = min(1.0, attempt / 60)
         where = np.mod(even + wander * rng.uniform(-0.5, 0.5, 3), 1.0)
         T_world_board = _candidate(view, options, where, rng)

@@ -12,16 +12,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.interrupts import without_interrupt
 from lce_rig.core.pattern import is_dark
-from lce_rig.simulate.surfaces import Material, Mesh, albedo, rectangle
+from lce_rig.simulate.surfaces import MATERIALS, Material, Mesh, albedo, rectangle
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _Rows = TypeVar("_Rows", bound="DataclassInstance")
-# Visible appearance of the board: a white plate, the linear albedo of black ink, a brown back.
-PLATE = Material((0.86, 0.87, 0.88), 0.95)
-PRINT_ALBEDO = 0.035
-PLATE_BACK = Material((0.30, 0.38, 0.45), 0.6)
+PLATE, INK, PLATE_BACK = (MATERIALS[name] for name in ("plate", "ink", "plate back"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +154,7 @@ class Scene:
         moving: Sequence[Surface],
         board: Board,
         T_world_board: Array,
-        print_reflectivity: float = 0.85,
+        print_reflectivity: float = INK.reflectivity,
     ) -> None:
         self.static = static
         self.moving = Raycaster(moving)
@@ -246,7 +243,7 @@ class Scene:
             rows = np.flatnonzero(hits.surface == index)
             if index == self.board_index:
                 is_print = self.is_dark(points_world[rows])
-                out[rows] = np.where(is_print[:, None], PRINT_ALBEDO, np.array(PLATE.colour))
+                out[rows] = np.where(is_print[:, None], INK.colour, PLATE.colour)
                 out[rows[~self.is_front(hits.normals[rows])]] = PLATE_BACK.colour
             elif index >= 0:
                 out[rows] = surface_colour(self.surfaces[index], points_world[rows], hits.normals[rows])

@@ -12,7 +12,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import DATA_SHEETS, DataSheet
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.geometry import Array, invert, perturb, pose
+from lce_rig.core.geometry import T_BODY_OPTICAL, Array, invert, perturb, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
@@ -25,10 +25,8 @@ from lce_rig.simulate.room import LIDAR_HEIGHT_M, Room, build_room
 # Streams of a session are [seed, OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
 OF_SESSION = 1_000_000_007
 TRUTH, ROOM, LASERS, START, PLACEMENT, SCAN, IMAGE, PIXELS, HAND, CARRIER, PHASE, EVENTS = range(12)
-# Camera optical axes (x right, y down, z forward) from the LiDAR's (x forward, y left, z up).
-_FORWARD = pose(
-    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
-)
+# T_cam_lidar of a camera without nominal extrinsics: 8 cm above and in front of the LiDAR, facing forward.
+_FORWARD = pose(T_BODY_OPTICAL[:3, :3].T, np.array([0.0, -0.08, -0.08]))
 # View, ahead of its first LiDAR, in which boards of a rig without cameras are placed.
 _WINDOW = Intrinsics(600.0, 600.0, 640.0, 360.0, 1280, 720)
 
@@ -155,7 +153,7 @@ def set_stage(
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
-        options.furnish,
+        options.decoys,
     )
     sheets: dict[str, DataSheet] = {}
     for name, settings in rig.lidars.items():

@@ -18,7 +18,7 @@ from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import sensor_gain
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.placements import Trajectory
-from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO
+from lce_rig.simulate.scene import INK, PLATE, PLATE_BACK
 
 GREY = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in a grey value (ITU-R BT.601), as OpenCV's."""
@@ -96,7 +96,7 @@ class MovingView:
         light = _light_on_board(self.board, T_world_board, self.backdrop)
         shade = light[0] + light[1] * x + light[2] * y + light[3] * x * y
         if eye[2] > 0:
-            white, ink = (np.float32(np.dot(GREY, colour)) for colour in (PLATE.colour, (PRINT_ALBEDO,) * 3))
+            white, ink = (np.float32(np.dot(GREY, colour)) for colour in (PLATE.colour, INK.colour))
             shade *= white + (ink - white) * self._print(x, y, spread_x, spread_y)
         else:
             shade *= np.float32(np.dot(GREY, PLATE_BACK.colour))

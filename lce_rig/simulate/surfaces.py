@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array, pose, transform
@@ -23,11 +25,15 @@ class Material:
         emission: linear radiance of its own, in units of the albedo.
     """
 
-    colour: tuple[float, float, float]
+    colour: Sequence[float]
     reflectivity: float
     pattern: Pattern = "plain"
     emission: float = 0.0
 
+
+ROOM = yaml.safe_load(Path(__file__).with_name("room.yaml").read_text(encoding="utf-8"))
+"""The room's size, lamps, furniture and materials."""
+MATERIALS = {name: Material(**material) for name, material in ROOM["materials"].items()}
 
 _LATTICE = np.random.default_rng(20240521).random((64, 64))
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import SIGMA_PER_MAD, Array
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 MIN_PAIRS = 4
@@ -190,7 +190,7 @@ class LineFit:
         residual = (residual - np.median(residual)) / sigma_ns
         keep = np.ones(len(residual), dtype=np.bool_)
         for _ in range(_N_ROUNDS):
-            scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
+            scale = max(SIGMA_PER_MAD * float(np.median(np.abs(residual))), 1.0)
             near = np.abs(residual) <= 3.5 * scale
             if near.sum() < _MIN_INLIERS or np.ptp(self.x_s[near]) == 0 or np.array_equal(near, keep):
                 break

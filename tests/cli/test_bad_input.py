@@ -14,7 +14,6 @@ from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, rig_truth, simulate_captures
 from lce_rig.simulate.room import LIDAR_HEIGHT_M
-from lce_rig.simulate.scene import PLATE
 from lce_rig.simulate.surfaces import rectangle
 
 
@@ -108,21 +107,20 @@ def test_all_captures_damaged_is_refused(lce_rig, session):
     assert "000000" in outcome.err
 
 
-def furnish_with_a_plate(low, high, _rng):
-    """Put a blank plate of the board's size into the room alone, at the rig's side and facing it."""
+def static_plate():
+    """A blank plate of the board's size at the rig's side, facing it."""
     board, centre = load_rig("rles").board.to_board(), np.array([1.1, 1.8, LIDAR_HEIGHT_M])
     facing, up = np.append(-centre[:2], 0.0) / np.linalg.norm(centre[:2]), np.array([0.0, 0.0, 1.0])
     diamond = exp_so3(np.array([0.0, 0.0, np.pi / 4]))
     T = pose(np.stack([np.cross(up, facing), up, facing], axis=1) @ diamond, centre)
-    plate = rectangle(board.width_m, board.height_m).moved(T)
-    return low, high, [("plate", plate, PLATE, T)], [(centre - 0.7, centre + 0.7)]
+    return "plate", rectangle(board.width_m, board.height_m).moved(T), "plate", T
 
 
 @pytest.mark.long
 def test_static_plate_is_not_the_board(tmp_path):
     """The decoy is in every scan; only the board moves with what the camera sees."""
     session, rig = tmp_path / "session", load_rig("rles")
-    options = replace(SimulationOptions.for_rig("rles"), furnish=furnish_with_a_plate)
+    options = replace(SimulationOptions.for_rig("rles"), decoys=[static_plate()])
     with Session.create(session, rig) as writer:
         for capture in simulate_captures(rig, n_captures=10, seed=5, options=options):
             writer.add_capture(capture.images, capture.scans, {})

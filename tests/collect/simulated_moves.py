@@ -6,8 +6,9 @@ from functools import cache
 from lce_rig.core.data import Events
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import load_rig
-from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_recording
+from lce_rig.simulate import HandMotion, SimulationOptions, simulate_recording
 from lce_rig.simulate.sampling import stamp_of
+from tests.exact_lidar import EXACT
 from tests.shared import compute_once
 
 DURATION_S = 1.8
@@ -16,7 +17,7 @@ _FIRST_SCAN_NS = 1_150_000_000
 #: Thin beams, a board that hangs in the air and no smear: quick to make.
 OPTIONS = SimulationOptions(
     carrier="none",
-    lidar=replace(LidarNoise.none(), range_sigma_m=0.008),
+    lidar=replace(EXACT, range_sigma_m=0.008),
     distance_m=(1.5, 2.2),
     frame_every_s=0.1,
     exposure_s=0.0,

@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
-from lce_rig.core.geometry import exp_so3, invert, pose
+from lce_rig.core.geometry import T_BODY_OPTICAL, exp_so3, invert, pose
 from lce_rig.export import EXPORTS, write_exports
 from lce_rig.export.other_tools import fit_lens
 from lce_rig.export.robot_tree import Joint, RobotTree
 from lce_rig.export.urdf import read_robot_urdf
-from lce_rig.export.writing import T_BODY_OPTICAL
 from lce_rig.io.camera_description import read_cameras
 from lce_rig.lens.models import grid_rays
 from tests.export.conftest import reason

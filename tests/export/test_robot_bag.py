@@ -12,16 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import T_BODY_OPTICAL, Array, pose
 from lce_rig.export import write_exports
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.urdf import read_robot, read_robot_bag
-from lce_rig.export.writing import R_BODY_OPTICAL
 from lce_rig.rig.profile import Mount
 
 Make = Callable[..., Calibration]
 Transform = tuple[str, str, Array]
-OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
 
 
 def write_bag(path, batches, topic="/tf_static"):
@@ -69,7 +67,7 @@ ROBOT = [
     ("base_link", "mast", placed(0.5)),
     ("mast", "velodyne", placed(0.0, 90)),
     ("base_link", "davis_link", placed(9.0)),
-    ("davis_link", "davis_optical_frame", OPTICAL),
+    ("davis_link", "davis_optical_frame", T_BODY_OPTICAL),
     ("odom_wheel", "wheel", placed(1.0)),
 ]
 
@@ -91,7 +89,7 @@ def test_robot_bag_of_any_kind_fits_outputs(rles, make, tmp_path, name):
         "mast": ("base_link", True),
         "velodyne": ("mast", False),
     }
-    T_base_lidar = placed(9.0) @ OPTICAL @ make().T_cam_lidar
+    T_base_lidar = placed(9.0) @ T_BODY_OPTICAL @ make().T_cam_lidar
     np.testing.assert_allclose(
         joints["velodyne"].T_parent_child, np.linalg.inv(placed(0.5)) @ T_base_lidar, atol=1e-9
     )
@@ -106,7 +104,9 @@ def test_robot_bag_lacking_optical_gets_one(rles, make, tmp_path):
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [ROBOT[:3]]))
     tree, changes, _ = fit_tree(robot, [make()], rles)
     assert [change.joint.child for change in changes] == ["velodyne", "davis_optical_frame"]
-    np.testing.assert_allclose(tree.find_pose("davis_link", "davis_optical_frame"), OPTICAL, atol=1e-12)
+    np.testing.assert_allclose(
+        tree.find_pose("davis_link", "davis_optical_frame"), T_BODY_OPTICAL, atol=1e-12
+    )
 
 
 def test_robot_bag_tree_starts_below_joint(rles, make, tmp_path):
@@ -124,7 +124,9 @@ def test_robot_bag_tree_starts_below_joint(rles, make, tmp_path):
         pytest.param([[*ROBOT, ("velodyne", "base_link", placed(0.3))]], id="a loop"),
         pytest.param([[*ROBOT[:1], ("mast", "velodyne", placed(np.nan))]], id="not rigid"),
         pytest.param([ROBOT[:1]], id="none of the sensors"),
-        pytest.param([[*ROBOT[:3], ("base_link", "davis_optical_frame", OPTICAL)]], id="optical elsewhere"),
+        pytest.param(
+            [[*ROBOT[:3], ("base_link", "davis_optical_frame", T_BODY_OPTICAL)]], id="optical elsewhere"
+        ),
     ],
 )
 def test_robot_bag_unfit_tree_is_refused(rles, make, tmp_path, batches):
@@ -174,5 +176,5 @@ def test_autoware_kit_keeps_robot_frames(rles, make, tmp_path):
     np.testing.assert_allclose(read_pose(base["base_link"]["sensor_kit_base_link"]), placed(0.9), atol=1e-12)
     poses = {name: read_pose(block) for name, block in kit["sensor_kit_base_link"].items()}
     assert set(poses) == {"top_base_link", "davis_link"}
-    T_cam_lidar = np.linalg.inv(poses["davis_link"] @ OPTICAL) @ poses["top_base_link"] @ housing
+    T_cam_lidar = np.linalg.inv(poses["davis_link"] @ T_BODY_OPTICAL) @ poses["top_base_link"] @ housing
     np.testing.assert_allclose(T_cam_lidar, make().T_cam_lidar, atol=1e-9)

@@ -8,7 +8,7 @@ import dpkt
 
 def build_frame(datagram):
     """Build the Ethernet frame of a datagram that was broadcast, as the sensor sends it when new."""
-    udp = dpkt.udp.UDP(sport=datagram.source_port, dport=datagram.port, data=datagram.payload)
+    udp = dpkt.udp.UDP(sport=datagram.port, dport=datagram.port, data=datagram.payload)
     udp.ulen = 8 + len(datagram.payload)
     source = socket.inet_aton(datagram.source)
     ip = dpkt.ip.IP(src=source, dst=b"\xff" * 4, p=dpkt.ip.IP_PROTO_UDP, df=1, data=udp)

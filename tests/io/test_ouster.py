@@ -88,7 +88,7 @@ def write_pcap(path, metadata, n_frames, range_m=4.0):
         else:
             packet["columns"]["frame"] = frame
         arrived_ns = T0_NS + step_ns * per * (k + 1) + 50_000
-        datagrams.append(Datagram(arrived_ns, "169.254.1.2", 50_000, 7502, packet.tobytes()))
+        datagrams.append(Datagram(arrived_ns, "169.254.1.2", 7502, packet.tobytes()))
     write_datagrams(path, datagrams)
 
 

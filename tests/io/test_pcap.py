@@ -25,7 +25,7 @@ IP_AT = 14
 
 
 def to_datagram(packet, source=SENSOR):
-    return Datagram(packet.sent_ns + NETWORK_NS, source, packet.port, packet.port, packet.payload)
+    return Datagram(packet.sent_ns + NETWORK_NS, source, packet.port, packet.payload)
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_pcap_of_other_link_types_is_refused(content, rig, tmp_path):
 
 def test_pcap_uses_the_profiles_sensor(datagrams, rig, tmp_path):
     both = [
-        (d.host_ns, build_frame(Datagram(d.host_ns, source, d.port, d.port, d.payload)))
+        (d.host_ns, build_frame(Datagram(d.host_ns, source, d.port, d.payload)))
         for d in datagrams
         for source in (SENSOR, "192.168.1.77")
     ]
@@ -190,7 +190,7 @@ def test_pcap_no_revolution_is_an_error(frames, rig, tmp_path):
     """No packets of the sensor, cut packets, or less than one revolution."""
     with pytest.raises(SourceError, match="243"):
         read(write_pcap(tmp_path / "a.pcap", frames, snaplen=96), rig)
-    mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns"))
+    mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, b"mdns"))
     for others in ([(T0_NS, mdns)] * 3, frames[:40]):
         with pytest.raises(SourceError):
             read(write_pcap(tmp_path / "a.pcap", others), rig)

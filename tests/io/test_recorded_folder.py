@@ -20,7 +20,7 @@ def record_packets(path):
     packets = packets_of(room_scans(10, T0_NS))
     write_datagrams(
         path,
-        (Datagram(p.sent_ns + NETWORK_NS, "127.0.0.1", p.port, p.port, p.payload) for p in packets),
+        (Datagram(p.sent_ns + NETWORK_NS, "127.0.0.1", p.port, p.payload) for p in packets),
     )
 
 

@@ -10,10 +10,10 @@ from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
 from lce_rig.simulate.surfaces import merge, rectangle
+from tests.exact_lidar import EXACT
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
 
-EXACT = LidarNoise.none()
 BEAM = replace(EXACT, divergence_rad=LidarNoise().divergence_rad, exit_size_m=LidarNoise().exit_size_m)
 FOOTPRINT_REACH_M = 0.010  # half the beam's exit plus half its divergence at 3 m, rounded up
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core.geometry import difference, exp_so3, invert, pose
-from lce_rig.simulate.options import HandMotion, LidarNoise
+from lce_rig.simulate.options import HandMotion
 from lce_rig.simulate.placements import carry_board, sway_board
 from lce_rig.simulate.scene import Raycaster, Scene
+from tests.exact_lidar import EXACT
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
 
@@ -74,7 +75,7 @@ def heights_m(scan, T_world_lidar, T_world_board):
 @pytest.mark.parametrize("seed", range(3))
 def test_lidar_meets_a_board_at_each_firing(board, T_world_lidar, seed):
     trajectory = sway(HandMotion(speed_mps=(0.5, 0.5), turn_deg_s=40.0), seed)
-    scan = moving_scan(board, T_world_lidar, trajectory, LidarNoise.none())
+    scan = moving_scan(board, T_world_lidar, trajectory, EXACT)
     assert scan.offset_ns is not None and scan.stamp_ns is not None and len(scan.points) > 500
     own = heights_m(scan, T_world_lidar, trajectory.at(scan.stamp_ns + scan.offset_ns))
     assert np.abs(own).max() < 1e-3

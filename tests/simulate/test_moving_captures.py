@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core.geometry import transform
-from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
+from lce_rig.simulate import HandMotion, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.stage import set_stage
+from tests.exact_lidar import EXACT
 
 from .conftest import PERFECT, QUIET_EVENTS, make_rig
 
@@ -16,7 +17,7 @@ MOVING = SimulationOptions(carrier="person", motion="moving", hand=HandMotion(sp
 QUIET = replace(
     MOVING,
     carrier="none",
-    lidar=LidarNoise.none(),
+    lidar=EXACT,
     camera=PERFECT,
     events=QUIET_EVENTS,
     hand=HandMotion(speed_mps=(0.3, 0.3)),

@@ -16,7 +16,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import T_BODY_OPTICAL, Array
 from lce_rig.rig import Rig
 
 #: Span of the captures that fills a bar, as a fraction of the reachable placements' span.
@@ -349,7 +349,7 @@ _FEWEST, _MOST = 2, 6
 # Minimum ratio of distances at which boards are described as near and far.
 _FAR = 1.4
 # Default T_cam_lidar: a LiDAR beside the camera, facing the same way; accurate enough to place a board.
-_SAME_WAY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+_SAME_WAY = T_BODY_OPTICAL.T
 
 
 def plan_captures(

@@ -11,7 +11,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.core.geometry import EVEN_STEPS, Array, exp_so3, invert, pose
 from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
 from lce_rig.rig import QualitySettings, Rig
 
@@ -115,8 +115,6 @@ REACH_M = (-0.9, 0.8)
 # Free border of the image, as a fraction of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
 _GRAZING_COSINE = 0.45
-# Powers of 1/g with g^4 = g + 1 fill three dimensions evenly (M. Roberts, 2018).
-_SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +158,7 @@ def spread_candidates(view: SensorPlace, n_places: int) -> Array:
         n_places: places of the board's centre, over the image and the distances, that are tried.
     """
     lens = view.model.lens
-    even = np.mod(0.5 + np.arange(1, n_places + 1)[:, None] * _SPREAD, 1.0)
+    even = np.mod(0.5 + np.arange(1, n_places + 1)[:, None] * EVEN_STEPS, 1.0)
     pixels = (0.1 + 0.8 * even[:, :2]) * [lens.width_px - 1, lens.height_px - 1]
     rays = lens.unproject(pixels)
     far_m = view.model.limits.max_distance_m

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -24,7 +23,7 @@ from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
-from lce_rig.devices.reading import Inbox, LiveSource, SourceStatus
+from lce_rig.devices.reading import READ_WAIT_S, Inbox, LiveSource, SourceStatus
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
@@ -37,10 +36,10 @@ WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
 # Fractions of the way, tried one after the other if an obstacle blocks it.
-_SHARES = (1.0, 0.75, 0.5, 0.25)
+_SHARES = np.linspace(1, 1 / 4, 4)
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
-_WAIT_S, _N_SLOTS = 0.2, 32
+_N_SLOTS = 32
 
 
 class SimulatedSource(LiveSource):
@@ -63,7 +62,7 @@ class SimulatedSource(LiveSource):
 
     def read(self) -> list[Image | Scan]:
         """Return the samples from the simulation; see `LiveSource`."""
-        came = self._taken.take(_WAIT_S)
+        came = self._taken.take(READ_WAIT_S)
         if came is None and self._failure is not None:
             raise self._failure
         return [] if came is None else [came[1]]
@@ -138,11 +137,9 @@ class SimulatedRig:
         self._reader.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the simulation."""
-        self._worker.__exit__(kind, error, trace)
+        self._worker.__exit__()
         self._reader.join()
 
     def watch(self, state: LiveState) -> None:

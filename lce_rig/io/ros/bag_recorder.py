@@ -20,11 +20,11 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 from lce_rig.rig import LidarSettings, Rig
+from lce_rig.timing.clock import NS_PER_S
 from lce_rig.timing.scan_pairing import event_channel
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-_NS_PER_S = 10**9
 _UINT16, _FLOAT32 = 4, 7
 _BAG_NAMES = {1: "recording.bag", 2: "recording"}
 # velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
@@ -80,7 +80,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryvie
         if scan.offset_ns is not None and len(scan.offset_ns):
             stamp_ns += int(scan.offset_ns.max())
         else:
-            stamp_ns += round(_NS_PER_S / settings.rate_hz)
+            stamp_ns += round(NS_PER_S / settings.rate_hz)
     points = np.empty(len(scan.points), _POINT if scan.offset_ns is None else _TIMED_POINT)
     for axis, name in enumerate("xyz"):
         points[name] = scan.points[:, axis]
@@ -108,7 +108,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryvie
 
 def _header(stamp_ns: int, frame_id: str, is_ros1: bool) -> Any:
     types = typestore(is_ros1).types
-    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     sequence = {"seq": 0} if is_ros1 else {}
     return types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id=frame_id)
