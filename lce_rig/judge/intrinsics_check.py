@@ -29,7 +29,6 @@ from lce_rig.judge.findings import (
     INTRINSICS_UNDETERMINED,
     LENS_MODEL,
     READOUT,
-    Verdict,
     failing,
 )
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
@@ -40,10 +39,8 @@ from lce_rig.lens.models import MODELS, model_of
 
 # A difference is significant below this probability.
 _CHANCE = 0.002
-# In units of the target rotation. An image bent by as much as that cannot reach it; a camera rotated by its
-# principal point rotates the extrinsics by the same angle, and three times the target counts as wrong.
-_BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
-_TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
+# Limits of bent images and of a camera rotated by its principal point, in units of the target rotation.
+_BENT, _TURNED = 0.5, 1.5
 _N_FOLDS = 2
 # Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
 # large as the profile's error where boards were seen, within these limits.
@@ -94,8 +91,8 @@ class IntrinsicsCheck:
     surprise: float | None = None
     is_contradicted: bool = False
 
-    def verdict(self, target_deg: float = 0.2) -> Verdict:
-        """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
+    def fits(self, target_deg: float = 0.2) -> bool:
+        """Check whether the given intrinsics are not significantly different from the fitted ones.
 
         Args:
             target_deg: target standard deviation of the extrinsics' rotation.
@@ -104,10 +101,7 @@ class IntrinsicsCheck:
         noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
         bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_displaced else 0.0
         turned = self.turn_deg if self.is_turned else 0.0
-        if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
-            return "fail"
-        is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
-        return "marginal" if is_marginal or self.is_contradicted else "pass"
+        return not (self.is_contradicted or bent > _BENT * target_deg or turned > _TURNED * target_deg)
 
     @property
     def is_displaced(self) -> bool:
@@ -202,11 +196,11 @@ def judge_lens(
     error_px = np.inf if check is None else check.displacement_px
     limit_px = float(np.clip(error_px, *_KNOWN_PX))
     figures: dict[str, Any] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
-    if check is not None and check.verdict(target_deg) == "pass":
+    if check is not None and check.fits(target_deg):
         return INTRINSICS_FIT(**figures)
-    if check is not None and check.surprise is not None and np.isfinite(image_sigma_px):
-        return INTRINSICS_BETTER(**figures)
-    return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
+    has_prior = check is not None and check.surprise is not None
+    is_known = np.isfinite(image_sigma_px) and (has_prior or image_sigma_px <= limit_px)
+    return (INTRINSICS_BETTER if is_known else INTRINSICS_UNDETERMINED)(**figures)
 
 
 def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> list[Finding]:
@@ -216,7 +210,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
         check: result for the intrinsics.
         target_deg: target standard deviation of the extrinsics' rotation.
     """
-    if check is None or check.verdict(target_deg) == "pass":
+    if check is None or check.fits(target_deg):
         return []
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Any] = {
@@ -225,14 +219,11 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
         "is_displaced": check.is_displaced,
         "is_turned": check.is_turned,
     }
-    severity, action = failing(check.verdict(target_deg) == "fail"), ""
-    if check.surprise is not None:
-        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is reported.
-        severity = "warning" if check.surprise > _OTHER_LENS else "note"
-        action = "" if severity == "warning" else "weighed"
-    elif judgement.code == "intrinsics.undetermined":
-        action = "collect"
-    return [INTRINSICS(severity=severity, action=action, **figures)]
+    if check.surprise is not None and check.surprise <= _OTHER_LENS:
+        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is a reason.
+        return [INTRINSICS(severity="note", action="weighed", **figures)]
+    is_open = check.surprise is None and judgement.code == "intrinsics.undetermined"
+    return [INTRINSICS(severity="warning", action="collect" if is_open else "", **figures)]
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:

@@ -229,7 +229,7 @@ def find_exchanged_cameras(
             check_intrinsics(each.views, lens, board)
             for each, lens in zip((first, second), lenses, strict=True)
         ]
-        if all(check is not None and check.verdict() == "pass" for check in checks):
+        if all(check is not None and check.fits() for check in checks):
             reasons.append("lenses")
     return [EXCHANGED(f"{first.name} and {second.name}", fits=tuple(reasons))] if reasons else []
 
