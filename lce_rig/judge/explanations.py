@@ -174,11 +174,11 @@ class Poses(NamedTuple):
     hessian: Array
     inverse: Array
 
-    def gain(self, explanation: Explanation, unit: float = 1.0) -> Gain:
-        """Compute (2) for a change of the extrinsics, in units of the captures' noise."""
+    def gain(self, explanation: Explanation) -> Gain:
+        """Compute (2) for a change of the extrinsics."""
         D = _AXES[:, 2:3] if explanation.cause == "focus_drift" else _AXES
         h, S = self.score(explanation.weights)
-        found = score_test(explanation, D.T @ h, D.T @ S @ D, _ANY, unit)
+        found = score_test(explanation, D.T @ h, D.T @ S @ D, _ANY)
         return found._replace(value=D @ found.value)
 
     def score(self, weights: Array) -> tuple[Array, Array]:
@@ -207,11 +207,6 @@ class Poses(NamedTuple):
         step = -self.inverse @ by_z
         gradient = self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
         return _unit(self.singles(gradient))
-
-    def unit_without_change(self, change: Gain) -> float:
-        """Measure the same under a change of the extrinsics."""
-        w, s = change.explanation.weights, change.value
-        return self.unit_without(w, np.tensordot(w, self.by_z, axes=1) @ s, self.hessian @ s)
 
     def moves(self) -> Iterator[Explanation]:
         """List moves before each capture."""
@@ -300,9 +295,11 @@ class Table:
 
     def unit_without(self, row: Gain) -> float:
         """Measure the noise of single captures under an explanation, in units of the usual noise."""
+        w = row.explanation.weights
         if row.cause in _OF_POSES:
-            return self.poses.unit_without_change(row)
-        w, along = row.explanation.weights, self._columns(row.cause) @ row.value
+            by_z = np.tensordot(w, self.poses.by_z, axes=1) @ row.value
+            return self.poses.unit_without(w, by_z, self.poses.hessian @ row.value)
+        along = self._columns(row.cause) @ row.value
         by_z = np.tensordot(w, self.cost.hessians, axes=1) @ along
         return self.poses.unit_without(w, by_z, np.einsum("kga,g->ka", self.poses.by_z, along))
 
@@ -381,12 +378,12 @@ class Table:
         return np.asarray(every[:, at[cause]])
 
 
-def score_test(explanation: Explanation, h: Array, S: Array, sigma: float, unit: float = 1.0) -> Gain:
+def score_test(explanation: Explanation, h: Array, S: Array, sigma: float) -> Gain:
     """Compute (2) in the directions of s that captures determine better than its standard deviation."""
     information, axes = np.linalg.eigh(sigma**2 * (S + S.T) / 2)
     is_known = information > 1
     along = sigma * (axes.T @ h)[is_known] / information[is_known]
-    chi2 = float(along**2 @ information[is_known]) / unit
+    chi2 = float(along**2 @ information[is_known])
     chance = log10_chance(chi2, len(along)) + np.log10(explanation.n_tried)
     return Gain(explanation, min(chance, 0.0), len(along), -sigma * axes[:, is_known] @ along)
 
@@ -514,26 +511,3 @@ def _misfits(after: Hypothesis, others: NDArray[np.bool_]) -> NDArray[np.bool_]:
     singles = poses.singles(poses.gradient)
     unit = _unit(singles[others])
     return np.array([log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles.tolist()])
-
-
-def find_change(cost: Quadratics) -> Gain | None:
-    """Search for a change of the extrinsics during the session, from costs of F captures in these alone.
-
-    The noise of these costs is unknown and estimated from single captures, with the change removed.
-
-    Args:
-        cost: in the extrinsics' tangent, settled.
-
-    Returns:
-        The change; None if it is not significant, or if single captures or two groups explain more.
-    """
-    inverse = np.asarray(np.linalg.inv(cost.information + np.eye(6) * 1e-9), dtype=np.float64)
-    x = -inverse @ (cost.gradients.sum(axis=0) + cost.prior_gradient)
-    poses = Poses(cost.gradients + cost.hessians @ x, cost.hessians, cost.hessians, inverse)
-    if len(cost.gradients) < 2 * _FEWEST_OF_GROUP:
-        return None
-    best = min((poses.gain(each) for each in poses.candidates()), key=lambda each: each.log10_chance)
-    if best.cause != "moved":
-        return None
-    found = poses.gain(best.explanation, poses.unit_without_change(best))
-    return found if found.log10_chance < _LEAST else None

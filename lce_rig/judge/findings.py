@@ -298,7 +298,6 @@ def _moved(finding: Finding) -> str:
     place, n = finding.figures["place"], finding.figure("n_captures")
     changed = fill("a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
-    cameras = f"{finding.subject} in their images: " if finding.subject else ""
     which = f"the {place} " if place else ""
     captures = fill("{n_captures} captures ({captures:few}) fit", finding.figures)
     if n == 1:
@@ -306,7 +305,7 @@ def _moved(finding: Finding) -> str:
     elif n == 0:
         which, captures = "", "no capture shows"
     sensor = finding.figures.get("sensor") or "a sensor"
-    return f"{cameras}{which}{captures} {changed}: {sensor} moved {fill(when, finding.figures)}"
+    return f"{which}{captures} {changed}: {sensor} moved {fill(when, finding.figures)}"
 
 
 def _agree(finding: Finding) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
-from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
+from lce_rig.calibrate.quadratics import symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
@@ -33,14 +33,12 @@ from lce_rig.core.geometry import (
 )
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import LidarDetection
-from lce_rig.judge.explanations import find_change
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
     EXCHANGED,
     FAIL_FACTOR,
     LIDARS_DIFFER,
     LIDARS_UNNAMED,
-    MOVED,
     OTHER_MODEL,
     failing,
 )
@@ -64,20 +62,12 @@ class RelativePose:
         T_second_first: (4, 4), p_second = R p_first + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
             between placements.
-        captures: (F,) that both cameras used, as the first names them.
         board_rms_m: rms distance between both cameras' positions of a board's middle.
-        scatter: scatter of single boards about it, in typical standard deviations of poses in images.
-        expansion: expansion of the cost about T_second_first, per capture.
-        centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
     T_second_first: Array
     cov: Array
-    captures: tuple[str, ...]
     board_rms_m: float
-    scatter: float
-    expansion: Quadratics
-    centres: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +158,7 @@ def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> Relat
         cov = max(scatter, 1.0) ** 2 * expansion.covariance()
     else:
         cov = expansion.jackknife_covariance()
-    captures = tuple(one.capture for one in firsts)
-    board_rms_m = _board_rms_m(shared, mean)
-    return RelativePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
+    return RelativePose(mean, cov, _board_rms_m(shared, mean))
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
@@ -260,40 +248,18 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
     """
     if pair.from_images is None or pair.apart is None:
         return []
-    seen = pair.from_images
-    cameras, findings = " to ".join(names), []
-    change = find_change(seen.expansion)
-    if change is not None:
-        rotation_deg, translation_m = tangent_sizes(change.value)
-        size = target.in_targets(rotation_deg, translation_m)
-        if size > 1:
-            cut, is_own = change.explanation.cut, change.explanation.weights > 0
-            findings.append(
-                MOVED(
-                    cameras,
-                    severity=failing(size > FAIL_FACTOR),
-                    captures=tuple(name for name, own in zip(seen.captures, is_own, strict=True) if own),
-                    n_captures=int(is_own.sum()),
-                    place="first" if is_own[0] else "last",
-                    neighbour=seen.captures[cut if is_own[0] else cut - 1],
-                    rotation_deg=rotation_deg,
-                    translation_m=translation_m,
-                    chance=float(10.0**change.log10_chance),
-                )
-            )
-    images_rms_m = pair.from_images.board_rms_m
     excess = target.excess(pair.apart)
-    if excess > 1:
-        findings.append(
-            CAMERAS_DIFFER(
-                cameras,
-                severity=failing(excess > FAIL_FACTOR),
-                rms_m=pair.board_rms_m,
-                images_rms_m=images_rms_m,
-                **pair.apart.sizes,
-            )
+    if excess <= 1:
+        return []
+    return [
+        CAMERAS_DIFFER(
+            " to ".join(names),
+            severity=failing(excess > FAIL_FACTOR),
+            rms_m=pair.board_rms_m,
+            images_rms_m=pair.from_images.board_rms_m,
+            **pair.apart.sizes,
         )
-    return findings
+    ]
 
 
 def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetection]) -> list[Finding]:
