@@ -18,6 +18,7 @@ from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, composition_slopes, invert
+from lce_rig.judge.causes import describe_move
 from lce_rig.judge.explanations import Explanation, Table, score_test
 from lce_rig.judge.findings import MOVED
 from lce_rig.judge.validate import Validation
@@ -94,20 +95,11 @@ class MovedSensor:
     def finding(self, pair: PairCosts) -> Finding:
         """Report the motion for a pair of this sensor: a note if its result uses only captures after it."""
         held = pair.used if pair.hypothesis is None else pair.hypothesis.captures
-        before = tuple(name for name in held if name < self.first_after)
-        after = tuple(name for name in held if name >= self.first_after)
-        is_first = len(before) < len(after)
-        captures = before if is_first else after
-        figures = {
-            **self.shown.figures,
-            "captures": captures,
-            "n_captures": len(captures),
-            "place": "first" if is_first else "last",
-            "neighbour": self.first_after if is_first else before[-1],
-            "sensor": self.name,
-        }
+        move = describe_move(held, sum(name < self.first_after for name in held))
         return replace(
-            self.shown, severity=self.shown.severity if self.is_within(pair) else "note", figures=figures
+            self.shown,
+            severity=self.shown.severity if self.is_within(pair) else "note",
+            figures={**self.shown.figures, **move, "sensor": self.name},
         )
 
 
