@@ -27,7 +27,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.judge.reach import JointDifference
+from lce_rig.judge.reach import CHANGED_CHI2, JointDifference
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import Rig
 from lce_rig.scene.findings import BOARD_CHANGED_JOINTLY, BOARD_HIDES
@@ -37,10 +37,8 @@ from lce_rig.scene.findings import BOARD_CHANGED_JOINTLY, BOARD_HIDES
 _BIAS = np.repeat([0.005, np.radians(0.1)], 3)
 _POWER_SIGMAS = 1.645  # 95 % of the trials at the smallest change exceed the threshold.
 # Largest useful hidden change, as displacement of the boards, m; above it, the boards' result is unknown.
-_LARGEST_M = 0.12
+_LARGEST_M = 0.15
 _MIN_PLACEMENTS = 3  # Minimum number to determine the scatter.
-# Limit for a change of six axes together: 99.9 % of chi-squared with six degrees of freedom.
-_CHANGED_CHI2 = 22.46
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class BoardDrift(JointDifference):
     @property
     def state(self) -> State:
         """The verdict; unchanged only if a change in any direction would be seen."""
-        if self.chi2 > _CHANGED_CHI2:
+        if self.is_changed:
             return "changed"
         return "unknown" if self._hidden_m > _LARGEST_M else "unchanged"
 
@@ -83,7 +81,7 @@ class BoardDrift(JointDifference):
         hides = BOARD_HIDES(
             rotation_deg=rotation_deg, translation_m=translation_m, rotation=turn, translation=shift
         )
-        if self.state != "changed":
+        if not self.is_changed:
             return (hides,)
         rotation_deg, translation_m = tangent_sizes(self.significant)
         changed = BOARD_CHANGED_JOINTLY(
@@ -97,7 +95,7 @@ class BoardDrift(JointDifference):
     @property
     def _hidden_m(self) -> float:
         """The largest hidden change, m at the boards: 95 % of trials with it exceed the threshold."""
-        return float((np.sqrt(_CHANGED_CHI2) + _POWER_SIGMAS) * np.sqrt(self.directions[0][-1]))
+        return float((np.sqrt(CHANGED_CHI2) + _POWER_SIGMAS) * np.sqrt(self.directions[0][-1]))
 
 
 def watch_boards(

@@ -10,7 +10,7 @@ from lce_rig.calibrate.likelihood.hypothesis import Hypothesis, at_full_weight
 from lce_rig.calibrate.likelihood.layout import Indices
 from lce_rig.calibrate.result import BY_ALGORITHM_1, CalibrationEstimate, Sensitivity
 from lce_rig.core.findings import Finding, Severity
-from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.explanations import MOUNTINGS, SCATTER, Cause, Selected, explain
@@ -34,14 +34,13 @@ from lce_rig.judge.findings import (
     SCATTERED,
     TWO_BOARDS,
 )
+from lce_rig.judge.reach import CHANGED_CHI2
 from lce_rig.rig import CalibrationSettings, Rig
 
 # Minimum number of captures to test: the constants alone can absorb fewer.
 _FEWEST = 6
 # Limit of the images' noise that counts as explained, in usual levels: one standard deviation of their prior.
 _USUAL = 2.0
-# Significance limit for an error of the extrinsics in use.
-_CHANCE = 1e-3
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
@@ -92,7 +91,7 @@ def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
         return selected
     apart = difference(selected.after.T_in_use, estimate.T_cam_lidar)
     cov = estimate.cov + summed_covariance([e for e in estimate.sensitivities if e.source != BY_ALGORITHM_1])
-    is_off = chance_of(float(apart @ np.linalg.solve(cov, apart)), 6) < _CHANCE
+    is_off = float(apart @ np.linalg.solve(cov, apart)) > CHANGED_CHI2
     return selected._replace(change=apart) if is_off else selected
 
 

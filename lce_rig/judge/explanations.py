@@ -56,24 +56,25 @@ Cause = Literal[
 ]
 MOUNTINGS: tuple[Cause, ...] = ("moved", "groups", "alone", "drift")
 """Causes that change the extrinsics during the session."""
-# Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried.
-_LEAST = -4.0
+LEAST = -4.0
+"""Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried."""
 # The same of explanations that are settled. Ring ends far from their edges count as strays, and (2)
 # understates their gain: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
 # settled -146.
 _TRIED = -2.0
-# Prior standard deviations of freed constant errors: the size of users' mistakes.
+WIDE = 0.2
+"""Prior standard deviation of freed errors, m, rad or a fraction: the size of users' mistakes."""
 _FREED: Mapping[Cause, Mapping[str, Any]] = {
-    "squares": {"squares": 0.2},
-    "pattern": {"pattern_m": 0.2},
-    "plate": {"plate_m": 0.2},
-    "bow": {"bow_m": 0.1},
-    "lens": {"optics": 100.0},
-    "range_offset": {"offset_m": 0.5},
-    "range_scale": {"stretch": 0.2},
-    "range_contrast": {"contrast_m": 0.2},
-    "azimuths": {"azimuth_rad": 0.1, "known": None},
-    "elevations": {"elevation_rad": 0.1, "known": None},
+    "squares": {"squares": WIDE},
+    "pattern": {"pattern_m": WIDE},
+    "plate": {"plate_m": WIDE},
+    "bow": {"bow_m": WIDE},
+    "lens": {"optics": 100.0},  # in standard deviations of the profile
+    "range_offset": {"offset_m": WIDE},
+    "range_scale": {"stretch": WIDE},
+    "range_contrast": {"contrast_m": WIDE},
+    "azimuths": {"azimuth_rad": WIDE, "known": None},
+    "elevations": {"elevation_rad": WIDE, "known": None},
 }
 _OF_CAMERA: tuple[Cause, ...] = ("focus_drift", "two_boards")
 ALL: tuple[Cause, ...] = (*_FREED, *_OF_CAMERA, *MOUNTINGS)
@@ -82,8 +83,6 @@ _UNSETTLED: tuple[Cause, ...] = ("drift", *_OF_CAMERA)
 # Changes of the extrinsics in (1). A focal length that grows by a fraction shows boards nearer by the same
 # fraction of their depth: a translation along the camera's axis.
 _OF_POSES: tuple[Cause, ...] = (*MOUNTINGS, "focus_drift")
-# Standard deviation of other unknowns: changes of the extrinsics, m and rad, and of the scale.
-_ANY = 1.0
 # Handicap of the rarer of two errors that only the plate's size separates, log10 of the probability: ranges
 # too long by a fraction look like squares larger than the profile's. On rlfs02, ranges of 2 % prefer the
 # right cause by 9, squares of 3 % the wrong one by 4.
@@ -178,7 +177,7 @@ class Poses(NamedTuple):
         """Compute (2) for a change of the extrinsics."""
         D = _AXES[:, 2:3] if explanation.cause == "focus_drift" else _AXES
         h, S = self.score(explanation.weights)
-        found = score_test(explanation, D.T @ h, D.T @ S @ D, _ANY)
+        found = score_test(explanation, D.T @ h, D.T @ S @ D, WIDE)
         return found._replace(value=D @ found.value)
 
     def score(self, weights: Array) -> tuple[Array, Array]:
@@ -348,7 +347,7 @@ class Table:
     def _gain(self, explanation: Explanation) -> Gain:
         """Compute (2) for a constant error."""
         c, w, D = self.cost, explanation.weights, self._columns(explanation.cause)
-        sigma = next(iter(_FREED.get(explanation.cause, {"": _ANY}).values()))
+        sigma = next(iter(_FREED.get(explanation.cause, {"": WIDE}).values()))
         by_z = np.tensordot(w, c.hessians, axes=1) @ D
         hessian = D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D
         h = D.T @ (w @ c.gradients) + by_z.T @ self.step
@@ -434,7 +433,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         once = {(row.cause, row.explanation.cut): row for row in tried}
         found = [_assume(hypothesis, noisy, row) for row in once.values()]
         best = min(found, key=lambda each: each.gain.log10_chance + _RARER.get(each.gain.cause, 0.0))
-        if best.gain.log10_chance > _LEAST:
+        if best.gain.log10_chance > LEAST:
             return
         yield best
         if best.after is hypothesis:
@@ -510,4 +509,4 @@ def _misfits(after: Hypothesis, others: NDArray[np.bool_]) -> NDArray[np.bool_]:
     poses = Table(after, frozenset()).poses
     singles = poses.singles(poses.gradient)
     unit = _unit(singles[others])
-    return np.array([log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles.tolist()])
+    return np.array([log10_chance(chi2 / unit, 6) < LEAST for chi2 in singles.tolist()])
