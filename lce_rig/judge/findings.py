@@ -78,18 +78,6 @@ _CAUSES = {
     "board_bow": "the board's bow",
     "algorithm_1": "Algorithm 1, which differs from the likelihood's estimate",
 }
-_CONTRADICTIONS = {
-    "channels": "the camera's channels",
-    "moved": "two mountings",
-    "drift": "the mounting at the beginning and at the end",
-    "scale": "the camera's distances and the LiDAR's",
-    "range_offset": "the LiDAR's ranges and the boards",
-    "range_scale": "the LiDAR's ranges and the boards",
-    "pattern_offset": "the pattern's place on the plate and the profile's",
-    "plate_size": "the plate's size and the profile's",
-    "laser_angles": "the lasers' angles and those of the scans",
-    "lens": "the intrinsics and the LiDAR",
-}
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
@@ -170,8 +158,7 @@ def cause_words(source: str) -> str:
     """Name a cause of standard deviations, as `Contribution.source`."""
     if source in _CAUSES:
         return _CAUSES[source]
-    check = source.removeprefix("contradiction_")
-    return f"the contradiction of {_CONTRADICTIONS.get(check, check.replace('_', ' '))}"
+    return f"the contradiction ({source.removeprefix('contradiction_').replace('_', ' ')})"
 
 
 def _correction(q: Mapping[str, Figure]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
-from lce_rig.calibrate.quadratics import symmetric_inverse, without_prior
+from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
@@ -110,15 +110,18 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     shared = shared_boards(first.observations, second.observations)
     if not shared:
         return None
-    T, J = relative_pose(second.T_cam_lidar, first.T_cam_lidar)
+    T = second.T_cam_lidar @ invert(first.T_cam_lidar)
     from_images = pose_from_images(shared)
     captures = tuple(one.capture for one, _ in shared)
     board_rms_m = _board_rms_m(shared, T)
     if from_images is None:
         return CameraPair(captures, None, None, board_rms_m)
     # Errors of the images enter both poses and are counted twice, which is conservative.
-    cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
-    apart = PoseDifference(difference(from_images.T_second_first, T), cov)
+    apart = _close_loop(
+        (from_images.T_second_first, from_images.cov),
+        (first.T_cam_lidar, first.cov),
+        (second.T_cam_lidar, second.cov),
+    )
     return CameraPair(captures, from_images, apart, board_rms_m)
 
 
@@ -138,24 +141,18 @@ def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> Relat
     T_second, cov_second = _poses(seconds)
     T, J = relative_pose(T_second, T_first)
     information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
-    # Start at the pose with the least median of squared distances (F, F) to all.
-    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
-    distances = np.einsum("mki,kij,mkj->mk", apart, information, apart)
-    middle = T[int(np.argmin(np.median(distances, axis=1)))]
 
     def weigh(chi2: Array) -> Array:
         """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
         return student_weights(chi2 / max(float(np.median(chi2)) / 6, 1.0))
 
-    mean, weight = mean_pose(T, information, middle, weigh)
+    mean, weight = mean_pose(T, information, weigh=weigh)
     apart = difference(T, mean)
-    chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
-    hessians = weight[:, None, None] * information
-    gradients = -(hessians @ apart[..., None])[..., 0]
-    expansion = without_prior(gradients, hessians, placement)
-    scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
+    hessians, none = weight[:, None, None] * information, np.zeros((6, 6))
+    expansion = Quadratics(-(hessians @ apart[..., None])[..., 0], hessians, none, none[0], placement)
     if len(expansion.groups) < _MIN_JACKKNIFE:
-        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
+        scatter = float(np.einsum("ki,kij,kj->", apart, information, apart)) / (6 * (len(T) - 1))
+        cov = max(scatter, 1.0) * expansion.covariance()
     else:
         cov = expansion.jackknife_covariance()
     return RelativePose(mean, cov, _board_rms_m(shared, mean))
@@ -334,10 +331,7 @@ def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
 
     All three results have seen the same boards: their errors are counted as independent.
     """
-    (T_first, cov_first), (T_between, cov_between), (T_second, cov_second) = loop[1:]
-    by_first, by_between = composition_slopes(T_first, T_between)
-    cov = by_first @ cov_first @ by_first.T + by_between @ cov_between @ by_between.T + cov_second
-    apart = PoseDifference(difference(T_first @ T_between, T_second), cov)
+    apart = _close_loop(loop.first, loop.between, loop.second)
     excess = target.excess(apart)
     if excess <= 1:
         return []
@@ -347,3 +341,12 @@ def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
             " and ".join(lidars), severity=failing(excess > FAIL_FACTOR), camera=camera, **apart.sizes
         )
     ]
+
+
+def _close_loop(
+    first: tuple[Array, Array], between: tuple[Array, Array], second: tuple[Array, Array]
+) -> PoseDifference:
+    """Compare the pose `first @ between` (4, 4) with `second`, each with its covariance (6, 6)."""
+    by_first, by_between = composition_slopes(first[0], between[0])
+    cov = by_first @ first[1] @ by_first.T + by_between @ between[1] @ by_between.T + second[1]
+    return PoseDifference(difference(first[0] @ between[0], second[0]), cov)
