@@ -66,23 +66,16 @@ def _row(kind: Kind) -> str:
 def _figures(template: Template) -> list[str]:
     """List the figures of a template; for a function, those in its docstring, as {name}."""
     text = template if isinstance(template, str) else template.__doc__ or ""
-    parsed = [(name, spec or "") for _, name, spec, _ in string.Formatter().parse(text) if name]
-    names = [each for name, spec in parsed for each in _named(name, spec)]
+    names = [name for _, name, _, _ in string.Formatter().parse(text) if name]
     return [name for name in names if name not in ("subject", "session")]
-
-
-def _named(name: str, spec: str) -> tuple[str, ...]:
-    """Name a figure; those of {change:size} have an angle's or a length's unit."""
-    return (f"{name}_deg", f"{name}_m") if spec.endswith("size") else (name,)
 
 
 def _shown(template: Template) -> str:
     """Show a template with the names of its figures in place of their values."""
     text = template if isinstance(template, str) else (template.__doc__ or "").splitlines()[0].rstrip(".")
     shown = ""
-    for before, name, spec, _ in string.Formatter().parse(text):
-        names = _named(name, spec or "") if name else ()
-        shown += before + ("SESSION" if name == "session" else " or ".join(f"*{each}*" for each in names))
+    for before, name, _, _ in string.Formatter().parse(text):
+        shown += before + ("SESSION" if name == "session" else f"*{name}*" if name else "")
     return shown
 
 

@@ -93,12 +93,6 @@ class Quadratics:
         return np.asarray(correction * jackknife_scatter(self.moves()))
 
 
-def without_prior(gradients: Array, hessians: Array, placement: NDArray[np.intp]) -> Quadratics:
-    """Build quadratics of costs without a prior."""
-    none = np.zeros_like(hessians[0])
-    return Quadratics(gradients, hessians, none, none[0], placement)
-
-
 def jackknife_scatter(moves: Array) -> Array:
     """Estimate the covariance (p, p) of an estimate from its leave-one-out shifts over G placements.
 

@@ -66,13 +66,8 @@ def motion_words(motion: str) -> str:
 
 
 def fill(template: str, figures: Mapping[str, Any]) -> str:
-    """Fill in figures, with enough digits to distinguish a figure from its limit.
-
-    {change:size} prints an angle change_deg or a length change_m, whichever is there; {change:+1size} has a
-    sign, and a digit more in mm.
-    """
-    parsed = string.Formatter().parse(template)
-    fields = [(text, *_sized(name, spec or "", figures)) for text, name, spec, _ in parsed]
+    """Fill in figures, with enough digits to distinguish a figure from its limit."""
+    fields = [(text, name, spec or "") for text, name, spec, _ in string.Formatter().parse(template)]
     specs = {name: spec for _, name, spec in fields if name is not None}
     more = dict.fromkeys(specs, 0)
     for limit in filter(lambda name: name.startswith(_LIMITS), specs):
@@ -88,16 +83,6 @@ def fill(template: str, figures: Mapping[str, Any]) -> str:
         text + ("" if name is None else _format(figures[name], spec, more[name]))
         for text, name, spec in fields
     )
-
-
-def _sized(name: str | None, spec: str, figures: Mapping[str, Any]) -> tuple[str | None, str]:
-    """Choose the figure and its unit for the spec "size"."""
-    if not spec.endswith("size"):
-        return name, spec
-    how = spec.removesuffix("size")
-    if f"{name}_deg" in figures:
-        return f"{name}_deg", how.strip("1") + "deg"
-    return f"{name}_m", how + "mm"
 
 
 def _more_digits(figure: tuple[float, str], limit: tuple[float, str]) -> int:

@@ -10,7 +10,7 @@ from lce_rig.calibrate.likelihood.hypothesis import Hypothesis, at_full_weight
 from lce_rig.calibrate.likelihood.layout import Indices
 from lce_rig.calibrate.result import BY_ALGORITHM_1, CalibrationEstimate, Sensitivity
 from lce_rig.core.findings import Finding, Severity
-from lce_rig.core.geometry import Array, chance_of, difference, tangent_sizes
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.explanations import MOUNTINGS, SCATTER, Cause, Selected, explain
@@ -34,14 +34,13 @@ from lce_rig.judge.findings import (
     SCATTERED,
     TWO_BOARDS,
 )
+from lce_rig.judge.reach import CHANGED_CHI2
 from lce_rig.rig import CalibrationSettings, Rig
 
 # Minimum number of captures to test: the constants alone can absorb fewer.
 _FEWEST = 6
 # Limit of the images' noise that counts as explained, in usual levels: one standard deviation of their prior.
 _USUAL = 2.0
-# Significance limit for an error of the extrinsics in use.
-_CHANCE = 1e-3
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
@@ -92,58 +91,53 @@ def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
         return selected
     apart = difference(selected.after.T_in_use, estimate.T_cam_lidar)
     cov = estimate.cov + summed_covariance([e for e in estimate.sensitivities if e.source != BY_ALGORITHM_1])
-    is_off = chance_of(float(apart @ np.linalg.solve(cov, apart)), 6) < _CHANCE
+    is_off = float(apart @ np.linalg.solve(cov, apart)) > CHANGED_CHI2
     return selected._replace(change=apart) if is_off else selected
 
 
-def cause_findings(
+def report_causes(
     selected: Sequence[Selected], estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str
-) -> list[Finding]:
+) -> tuple[list[Finding], list[Sensitivity]]:
     """Report the causes, each with a severity from its displacement of the extrinsics in use.
 
     The most significant one of the highest severity is the reason. The others are notes, as they may follow
     from it.
+
+    Returns:
+        The findings, and the displacement of the extrinsics that resolves the reason, if there is one.
     """
-    found = [_finding(each, estimate, rig, camera, lidar) for each in selected]
-    told = [each for each in found if each is not None]
-    reason = next((f for s in ("error", "warning") for f in told if f.severity == s), None)
-    if reason is not None:
-        return [reason, *(replace(each, severity="note") for each in told if each is not reason)]
+    named = [(each, _finding(each, estimate, rig, camera, lidar)) for each in selected]
+    found = [finding for _, finding in named if finding is not None]
+    reasons = [(f, each) for s in ("error", "warning") for each, f in named if f and f.severity == s]
+    if reasons:
+        reason, cause = reasons[0]
+        others = [replace(each, severity="note") for each in found if each is not reason]
+        # Sizes of the plate follow from others.
+        follows = reason.code in PLATES and not OF_SIZES.isdisjoint(each.code for each in others)
+        is_resolved = follows or _is_over(cause, estimate.used)
+        return [reason, *others], [] if is_resolved else [_displacement(cause, reason)]
     if selected or estimate.joint is None:
-        return told
+        return found, []
     levels = estimate.joint[0].levels
     if levels.of_ranges > max(levels.largest_of_images, SCATTER):
-        return [SCATTERED(lidar, action="ranges", ratio=levels.of_ranges)]
-    return [SCATTERED(ratio=levels.largest_of_images)] if levels.largest_of_images > SCATTER else []
+        return [SCATTERED(lidar, action="ranges", ratio=levels.of_ranges)], []
+    is_noisy = levels.largest_of_images > SCATTER
+    return [SCATTERED(ratio=levels.largest_of_images)] if is_noisy else [], []
+
+
+def _displacement(cause: Selected, reason: Finding) -> Sensitivity:
+    """Return the displacement of the extrinsics that resolves a cause.
+
+    The result lies between two groups of captures that differ, which gives half of their change. After a move
+    the whole change counts, as either side may hold now.
+    """
+    share = 0.5 if cause.gain.cause == "groups" else 1.0
+    return Sensitivity(reason.code.removeprefix("verdict."), 1.0, share * cause.change[None])
 
 
 def is_explained(selected: Sequence[Selected]) -> bool:
     """Check whether the causes leave about the usual noise, so that symptoms can follow from them."""
     return bool(selected) and selected[-1].after.with_fitted_noise.levels.largest_of_images < _USUAL
-
-
-def contradiction_of(
-    selected: Sequence[Selected], findings: Sequence[Finding], used: Sequence[str]
-) -> list[Sensitivity]:
-    """Return the displacement of the extrinsics that resolves the reason, if there is one.
-
-    The result lies between two groups of captures that differ, which gives half of their change. After a move
-    the whole change counts, as either side may hold now.
-
-    Args:
-        selected: the causes.
-        findings: their findings.
-        used: captures of the result.
-    """
-    codes = {each.code for each in findings if each.severity != "note"}
-    if OF_SIZES.intersection(each.code for each in findings):
-        codes -= PLATES  # They follow.
-    for each in selected:
-        code = _CODES[each.gain.cause]
-        if code in codes and not _is_over(each, used):
-            share = 0.5 if each.gain.cause == "groups" else 1.0
-            return [Sensitivity(code.removeprefix("verdict."), 1.0, share * each.change[None])]
-    return []
 
 
 def _is_over(selected: Selected, used: Sequence[str]) -> bool:
@@ -239,43 +233,27 @@ def _of_mounting(
     if explanation.cause == "drift":
         return DRIFTED(severity=severity, chance=chance, **apart)
     captures = tuple(name for name, w in zip(names, explanation.weights, strict=True) if w > 0)
-    is_unused = not set(captures) & set(estimate.used)
     if explanation.cause == "alone":
-        if is_unused:
+        if not set(captures) & set(estimate.used):
             return None
         # A note: its weight in the result is small.
         return OUTLIER(severity="note", capture=captures[0], **apart)
-    place, neighbour = "", ""
+    figures: dict[str, Any] = {
+        "captures": captures,
+        "n_captures": len(captures),
+        "place": "",
+        "neighbour": "",
+    }
     if explanation.cause == "moved":
-        is_first = explanation.weights[0] > 0
-        place = "first" if is_first else "last"
-        neighbour = names[explanation.cut if is_first else explanation.cut - 1]
-    return MOVED(
-        severity="warning" if severity == "error" and _is_over(selected, estimate.used) else severity,
-        captures=captures,
-        n_captures=len(captures),
-        place=place,
-        neighbour=neighbour,
-        chance=chance,
-        **apart,
-    )
+        figures = describe_move(names, explanation.cut)
+    severity = "warning" if severity == "error" and _is_over(selected, estimate.used) else severity
+    return MOVED(severity=severity, chance=chance, **figures, **apart)
 
 
-_CODES: dict[Cause, str] = {
-    "squares": SCALE_OFF.code,
-    "pattern": PATTERN_OFFSET.code,
-    "plate": PLATE_SIZE.code,
-    "bow": BOW.code,
-    "lens": LENS.code,
-    "range_offset": RANGE_OFFSET.code,
-    "range_scale": RANGE_SCALE.code,
-    "range_contrast": RANGE_CONTRAST.code,
-    "azimuths": LASER_ANGLES.code,
-    "elevations": LASER_ANGLES.code,
-    "moved": MOVED.code,
-    "groups": MOVED.code,
-    "alone": OUTLIER.code,
-    "drift": DRIFTED.code,
-    "focus_drift": FOCUS_DRIFT.code,
-    "two_boards": TWO_BOARDS.code,
-}
+def describe_move(captures: Sequence[str], cut: int) -> dict[str, Any]:
+    """Return the smaller side of a move before capture `cut`, and the capture next to it, as figures."""
+    is_first = 2 * cut < len(captures)
+    own = tuple(captures[:cut] if is_first else captures[cut:])
+    neighbour = captures[cut if is_first else cut - 1]
+    place = "first" if is_first else "last"
+    return {"captures": own, "n_captures": len(own), "place": place, "neighbour": neighbour}

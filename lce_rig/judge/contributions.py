@@ -18,8 +18,6 @@ from lce_rig.rig import CalibrationSettings
 
 OF_BOARD = ("square_size", "pattern_offset", "plate_size", "board_bow")
 """Errors of the profile that sessions share; each fits its own lens."""
-# Part of the difference of two channels that counts: the result lies between both.
-_HALF = 0.5
 _CONTRADICTION = "contradiction_"
 _OTHER_ACTIONS = {BY_ALGORITHM_1: "other_method"}
 
@@ -34,7 +32,7 @@ def channels_contradict(estimate: CalibrationEstimate, target: CalibrationSettin
     apart = estimate.channel_difference
     if apart is None or target.excess(apart) <= 1:
         return []
-    return [Sensitivity("channels", 1.0, _HALF * apart.tangent[None])]
+    return [Sensitivity("channels", 1.0, apart.tangent[None] / 2)]
 
 
 def list_contributions(

@@ -56,24 +56,25 @@ Cause = Literal[
 ]
 MOUNTINGS: tuple[Cause, ...] = ("moved", "groups", "alone", "drift")
 """Causes that change the extrinsics during the session."""
-# Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried.
-_LEAST = -4.0
+LEAST = -4.0
+"""Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried."""
 # The same of explanations that are settled. Ring ends far from their edges count as strays, and (2)
 # understates their gain: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
 # settled -146.
 _TRIED = -2.0
-# Prior standard deviations of freed constant errors: the size of users' mistakes.
+WIDE = 0.2
+"""Prior standard deviation of freed errors, m, rad or a fraction: the size of users' mistakes."""
 _FREED: Mapping[Cause, Mapping[str, Any]] = {
-    "squares": {"squares": 0.2},
-    "pattern": {"pattern_m": 0.2},
-    "plate": {"plate_m": 0.2},
-    "bow": {"bow_m": 0.1},
-    "lens": {"optics": 100.0},
-    "range_offset": {"offset_m": 0.5},
-    "range_scale": {"stretch": 0.2},
-    "range_contrast": {"contrast_m": 0.2},
-    "azimuths": {"azimuth_rad": 0.1, "known": None},
-    "elevations": {"elevation_rad": 0.1, "known": None},
+    "squares": {"squares": WIDE},
+    "pattern": {"pattern_m": WIDE},
+    "plate": {"plate_m": WIDE},
+    "bow": {"bow_m": WIDE},
+    "lens": {"optics": 100.0},  # in standard deviations of the profile
+    "range_offset": {"offset_m": WIDE},
+    "range_scale": {"stretch": WIDE},
+    "range_contrast": {"contrast_m": WIDE},
+    "azimuths": {"azimuth_rad": WIDE, "known": None},
+    "elevations": {"elevation_rad": WIDE, "known": None},
 }
 _OF_CAMERA: tuple[Cause, ...] = ("focus_drift", "two_boards")
 ALL: tuple[Cause, ...] = (*_FREED, *_OF_CAMERA, *MOUNTINGS)
@@ -82,8 +83,6 @@ _UNSETTLED: tuple[Cause, ...] = ("drift", *_OF_CAMERA)
 # Changes of the extrinsics in (1). A focal length that grows by a fraction shows boards nearer by the same
 # fraction of their depth: a translation along the camera's axis.
 _OF_POSES: tuple[Cause, ...] = (*MOUNTINGS, "focus_drift")
-# Standard deviation of other unknowns: changes of the extrinsics, m and rad, and of the scale.
-_ANY = 1.0
 # Handicap of the rarer of two errors that only the plate's size separates, log10 of the probability: ranges
 # too long by a fraction look like squares larger than the profile's. On rlfs02, ranges of 2 % prefer the
 # right cause by 9, squares of 3 % the wrong one by 4.
@@ -174,11 +173,11 @@ class Poses(NamedTuple):
     hessian: Array
     inverse: Array
 
-    def gain(self, explanation: Explanation, unit: float = 1.0) -> Gain:
-        """Compute (2) for a change of the extrinsics, in units of the captures' noise."""
+    def gain(self, explanation: Explanation) -> Gain:
+        """Compute (2) for a change of the extrinsics."""
         D = _AXES[:, 2:3] if explanation.cause == "focus_drift" else _AXES
         h, S = self.score(explanation.weights)
-        found = score_test(explanation, D.T @ h, D.T @ S @ D, _ANY, unit)
+        found = score_test(explanation, D.T @ h, D.T @ S @ D, WIDE)
         return found._replace(value=D @ found.value)
 
     def score(self, weights: Array) -> tuple[Array, Array]:
@@ -207,11 +206,6 @@ class Poses(NamedTuple):
         step = -self.inverse @ by_z
         gradient = self.gradient + np.einsum("kga,g->ka", self.by_z, step) + weights[:, None] * by_pose
         return _unit(self.singles(gradient))
-
-    def unit_without_change(self, change: Gain) -> float:
-        """Measure the same under a change of the extrinsics."""
-        w, s = change.explanation.weights, change.value
-        return self.unit_without(w, np.tensordot(w, self.by_z, axes=1) @ s, self.hessian @ s)
 
     def moves(self) -> Iterator[Explanation]:
         """List moves before each capture."""
@@ -300,9 +294,11 @@ class Table:
 
     def unit_without(self, row: Gain) -> float:
         """Measure the noise of single captures under an explanation, in units of the usual noise."""
+        w = row.explanation.weights
         if row.cause in _OF_POSES:
-            return self.poses.unit_without_change(row)
-        w, along = row.explanation.weights, self._columns(row.cause) @ row.value
+            by_z = np.tensordot(w, self.poses.by_z, axes=1) @ row.value
+            return self.poses.unit_without(w, by_z, self.poses.hessian @ row.value)
+        along = self._columns(row.cause) @ row.value
         by_z = np.tensordot(w, self.cost.hessians, axes=1) @ along
         return self.poses.unit_without(w, by_z, np.einsum("kga,g->ka", self.poses.by_z, along))
 
@@ -351,7 +347,7 @@ class Table:
     def _gain(self, explanation: Explanation) -> Gain:
         """Compute (2) for a constant error."""
         c, w, D = self.cost, explanation.weights, self._columns(explanation.cause)
-        sigma = next(iter(_FREED.get(explanation.cause, {"": _ANY}).values()))
+        sigma = next(iter(_FREED.get(explanation.cause, {"": WIDE}).values()))
         by_z = np.tensordot(w, c.hessians, axes=1) @ D
         hessian = D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D
         h = D.T @ (w @ c.gradients) + by_z.T @ self.step
@@ -381,12 +377,12 @@ class Table:
         return np.asarray(every[:, at[cause]])
 
 
-def score_test(explanation: Explanation, h: Array, S: Array, sigma: float, unit: float = 1.0) -> Gain:
+def score_test(explanation: Explanation, h: Array, S: Array, sigma: float) -> Gain:
     """Compute (2) in the directions of s that captures determine better than its standard deviation."""
     information, axes = np.linalg.eigh(sigma**2 * (S + S.T) / 2)
     is_known = information > 1
     along = sigma * (axes.T @ h)[is_known] / information[is_known]
-    chi2 = float(along**2 @ information[is_known]) / unit
+    chi2 = float(along**2 @ information[is_known])
     chance = log10_chance(chi2, len(along)) + np.log10(explanation.n_tried)
     return Gain(explanation, min(chance, 0.0), len(along), -sigma * axes[:, is_known] @ along)
 
@@ -437,7 +433,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         once = {(row.cause, row.explanation.cut): row for row in tried}
         found = [_assume(hypothesis, noisy, row) for row in once.values()]
         best = min(found, key=lambda each: each.gain.log10_chance + _RARER.get(each.gain.cause, 0.0))
-        if best.gain.log10_chance > _LEAST:
+        if best.gain.log10_chance > LEAST:
             return
         yield best
         if best.after is hypothesis:
@@ -513,27 +509,4 @@ def _misfits(after: Hypothesis, others: NDArray[np.bool_]) -> NDArray[np.bool_]:
     poses = Table(after, frozenset()).poses
     singles = poses.singles(poses.gradient)
     unit = _unit(singles[others])
-    return np.array([log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles.tolist()])
-
-
-def find_change(cost: Quadratics) -> Gain | None:
-    """Search for a change of the extrinsics during the session, from costs of F captures in these alone.
-
-    The noise of these costs is unknown and estimated from single captures, with the change removed.
-
-    Args:
-        cost: in the extrinsics' tangent, settled.
-
-    Returns:
-        The change; None if it is not significant, or if single captures or two groups explain more.
-    """
-    inverse = np.asarray(np.linalg.inv(cost.information + np.eye(6) * 1e-9), dtype=np.float64)
-    x = -inverse @ (cost.gradients.sum(axis=0) + cost.prior_gradient)
-    poses = Poses(cost.gradients + cost.hessians @ x, cost.hessians, cost.hessians, inverse)
-    if len(cost.gradients) < 2 * _FEWEST_OF_GROUP:
-        return None
-    best = min((poses.gain(each) for each in poses.candidates()), key=lambda each: each.log10_chance)
-    if best.cause != "moved":
-        return None
-    found = poses.gain(best.explanation, poses.unit_without_change(best))
-    return found if found.log10_chance < _LEAST else None
+    return np.array([log10_chance(chi2 / unit, 6) < LEAST for chi2 in singles.tolist()])

@@ -78,18 +78,6 @@ _CAUSES = {
     "board_bow": "the board's bow",
     "algorithm_1": "Algorithm 1, which differs from the likelihood's estimate",
 }
-_CONTRADICTIONS = {
-    "channels": "the camera's channels",
-    "moved": "two mountings",
-    "drift": "the mounting at the beginning and at the end",
-    "scale": "the camera's distances and the LiDAR's",
-    "range_offset": "the LiDAR's ranges and the boards",
-    "range_scale": "the LiDAR's ranges and the boards",
-    "pattern_offset": "the pattern's place on the plate and the profile's",
-    "plate_size": "the plate's size and the profile's",
-    "laser_angles": "the lasers' angles and those of the scans",
-    "lens": "the intrinsics and the LiDAR",
-}
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
@@ -170,8 +158,7 @@ def cause_words(source: str) -> str:
     """Name a cause of standard deviations, as `Contribution.source`."""
     if source in _CAUSES:
         return _CAUSES[source]
-    check = source.removeprefix("contradiction_")
-    return f"the contradiction of {_CONTRADICTIONS.get(check, check.replace('_', ' '))}"
+    return f"the contradiction ({source.removeprefix('contradiction_').replace('_', ' ')})"
 
 
 def _correction(q: Mapping[str, Figure]) -> str:
@@ -298,7 +285,6 @@ def _moved(finding: Finding) -> str:
     place, n = finding.figures["place"], finding.figure("n_captures")
     changed = fill("a mounting changed by " + _APART, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
-    cameras = f"{finding.subject} in their images: " if finding.subject else ""
     which = f"the {place} " if place else ""
     captures = fill("{n_captures} captures ({captures:few}) fit", finding.figures)
     if n == 1:
@@ -306,7 +292,7 @@ def _moved(finding: Finding) -> str:
     elif n == 0:
         which, captures = "", "no capture shows"
     sensor = finding.figures.get("sensor") or "a sensor"
-    return f"{cameras}{which}{captures} {changed}: {sensor} moved {fill(when, finding.figures)}"
+    return f"{which}{captures} {changed}: {sensor} moved {fill(when, finding.figures)}"
 
 
 def _agree(finding: Finding) -> str:

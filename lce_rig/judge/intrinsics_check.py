@@ -29,7 +29,6 @@ from lce_rig.judge.findings import (
     INTRINSICS_UNDETERMINED,
     LENS_MODEL,
     READOUT,
-    Verdict,
     failing,
 )
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
@@ -40,10 +39,8 @@ from lce_rig.lens.models import MODELS, model_of
 
 # A difference is significant below this probability.
 _CHANCE = 0.002
-# In units of the target rotation. An image bent by as much as that cannot reach it; a camera rotated by its
-# principal point rotates the extrinsics by the same angle, and three times the target counts as wrong.
-_BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
-_TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
+# Limits of bent images and of a camera rotated by its principal point, in units of the target rotation.
+_BENT, _TURNED = 0.5, 1.5
 _N_FOLDS = 2
 # Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
 # large as the profile's error where boards were seen, within these limits.
@@ -52,13 +49,14 @@ _KNOWN_PX = (1.0, 5.0)
 _OTHER_LENS = 36.0
 # Limit of residuals in the median image, in units of the noise, beyond which the lens is another one: 0.5 to
 # 1.1 in 17 sound sessions, 11 of them recorded; 6 for a fisheye lens entered as radtan. Twice that fails.
-_MISFIT, _FAIL = 2.0, 2.0
+# Another model must fit better by the same factor.
+_MISFIT = 2.0
 # Variance of shears along the image's rows in the median image, in units of the corners' noise: in ten sound
 # recordings 0.1 to 2.0, in three of them with rows read out over 20 ms while boards move at 0.15 m/s 0.3
 # (corner noise 0.2 px), 8 and 11. Shears are printed per 100 rows.
 _READOUT, _ROWS = 4.0, 100.0
-# Minimum ratio of the distances of the profile's model and of one that fits.
-_NEARER, _ALIKE = 2.0, 1.25
+# Largest ratio of the residuals of models that fit about equally well.
+_ALIKE = 1.25
 _DEGREE, _LEAST_FREEDOMS = 3, 8
 
 
@@ -94,8 +92,8 @@ class IntrinsicsCheck:
     surprise: float | None = None
     is_contradicted: bool = False
 
-    def verdict(self, target_deg: float = 0.2) -> Verdict:
-        """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
+    def fits(self, target_deg: float = 0.2) -> bool:
+        """Check whether the given intrinsics are not significantly different from the fitted ones.
 
         Args:
             target_deg: target standard deviation of the extrinsics' rotation.
@@ -104,10 +102,7 @@ class IntrinsicsCheck:
         noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
         bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_displaced else 0.0
         turned = self.turn_deg if self.is_turned else 0.0
-        if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
-            return "fail"
-        is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
-        return "marginal" if is_marginal or self.is_contradicted else "pass"
+        return not (self.is_contradicted or bent > _BENT * target_deg or turned > _TURNED * target_deg)
 
     @property
     def is_displaced(self) -> bool:
@@ -202,11 +197,11 @@ def judge_lens(
     error_px = np.inf if check is None else check.displacement_px
     limit_px = float(np.clip(error_px, *_KNOWN_PX))
     figures: dict[str, Any] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
-    if check is not None and check.verdict(target_deg) == "pass":
+    if check is not None and check.fits(target_deg):
         return INTRINSICS_FIT(**figures)
-    if check is not None and check.surprise is not None and np.isfinite(image_sigma_px):
-        return INTRINSICS_BETTER(**figures)
-    return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
+    has_prior = check is not None and check.surprise is not None
+    is_known = np.isfinite(image_sigma_px) and (has_prior or image_sigma_px <= limit_px)
+    return (INTRINSICS_BETTER if is_known else INTRINSICS_UNDETERMINED)(**figures)
 
 
 def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> list[Finding]:
@@ -216,7 +211,7 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
         check: result for the intrinsics.
         target_deg: target standard deviation of the extrinsics' rotation.
     """
-    if check is None or check.verdict(target_deg) == "pass":
+    if check is None or check.fits(target_deg):
         return []
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Any] = {
@@ -225,14 +220,11 @@ def lens_findings(check: IntrinsicsCheck | None, target_deg: float = 0.2) -> lis
         "is_displaced": check.is_displaced,
         "is_turned": check.is_turned,
     }
-    severity, action = failing(check.verdict(target_deg) == "fail"), ""
-    if check.surprise is not None:
-        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is reported.
-        severity = "warning" if check.surprise > _OTHER_LENS else "note"
-        action = "" if severity == "warning" else "weighed"
-    elif judgement.code == "intrinsics.undetermined":
-        action = "collect"
-    return [INTRINSICS(severity=severity, action=action, **figures)]
+    if check.surprise is not None and check.surprise <= _OTHER_LENS:
+        # The result uses the fitted intrinsics; only a lens that hardly resembles the profile's is a reason.
+        return [INTRINSICS(severity="note", action="weighed", **figures)]
+    is_open = check.surprise is None and judgement.code == "intrinsics.undetermined"
+    return [INTRINSICS(severity="warning", action="collect" if is_open else "", **figures)]
 
 
 def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
@@ -264,15 +256,15 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
     # Among models that fit about equally well, choose the one with the fewest parameters.
     near = [name for name, px in reached.items() if px < _ALIKE * least_px]
     best = min(near, key=lambda name: MODELS[name].size, default="")
-    if _NEARER * least_px > fitted.rms_px:
+    if _MISFIT * least_px > fitted.rms_px:
         if sheared := _readout(fitted, noise_px):
             return sheared
         best = ""
-    elif reached.get(own, np.inf) < _NEARER * least_px:
+    elif reached.get(own, np.inf) < _MISFIT * least_px:
         return []
     typical_px = float(np.nanmedian(noise_px))
     finding = LENS_MODEL(
-        severity=failing(fitted.rms_px > _FAIL * _MISFIT * typical_px),
+        severity=failing(fitted.rms_px > _MISFIT**2 * typical_px),
         action="" if best else "none",
         model=own,
         rms_px=fitted.rms_px,

@@ -18,14 +18,10 @@ from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, composition_slopes, invert
-from lce_rig.judge.explanations import Explanation, Table, score_test
+from lce_rig.judge.causes import describe_move
+from lce_rig.judge.explanations import LEAST, WIDE, Explanation, Table, score_test
 from lce_rig.judge.findings import MOVED
 from lce_rig.judge.validate import Validation
-
-# Lead of a sensor over the next one, log10 of the probability: the pairs are not independent.
-_LEAD = 4.0
-# Standard deviation, m and rad, of motions that captures must determine better.
-_KNOWN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +90,11 @@ class MovedSensor:
     def finding(self, pair: PairCosts) -> Finding:
         """Report the motion for a pair of this sensor: a note if its result uses only captures after it."""
         held = pair.used if pair.hypothesis is None else pair.hypothesis.captures
-        before = tuple(name for name in held if name < self.first_after)
-        after = tuple(name for name in held if name >= self.first_after)
-        is_first = len(before) < len(after)
-        captures = before if is_first else after
-        figures = {
-            **self.shown.figures,
-            "captures": captures,
-            "n_captures": len(captures),
-            "place": "first" if is_first else "last",
-            "neighbour": self.first_after if is_first else before[-1],
-            "sensor": self.name,
-        }
+        move = describe_move(held, sum(name < self.first_after for name in held))
         return replace(
-            self.shown, severity=self.shown.severity if self.is_within(pair) else "note", figures=figures
+            self.shown,
+            severity=self.shown.severity if self.is_within(pair) else "note",
+            figures={**self.shown.figures, **move, "sensor": self.name},
         )
 
 
@@ -148,7 +135,7 @@ def find_moved_sensor(pairs: Sequence[PairCosts]) -> MovedSensor | None:
     ranked = sorted(motions, key=lambda each: each.log10_chance)
     # At most two sensors are part of all pairs that show a motion.
     next_chance = ranked[1].log10_chance if len(ranked) > 1 else 0.0
-    return ranked[0] if ranked and ranked[0].log10_chance < next_chance - _LEAD else None
+    return ranked[0] if ranked and ranked[0].log10_chance < next_chance + LEAST else None
 
 
 def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
@@ -164,7 +151,7 @@ def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
         for captures, poses, A in own:
             slope, information = poses.score(np.array([float(name >= first_after) for name in captures]))
             h, S = h + A.T @ slope, S + A.T @ information @ A
-        found = score_test(Explanation("moved", np.empty(0)), h, S, _KNOWN)
+        found = score_test(Explanation("moved", np.empty(0)), h, S, WIDE)
         yield MovedSensor(sensor, first_after, found.log10_chance, shown)
 
 

@@ -18,10 +18,12 @@ from lce_rig.lens.models import LensModel, model_of
 
 DISTANCES_M = (5.0, 10.0, 20.0)
 """Distances of the points whose uncertainty is reported: beyond the boards, where rotation errors grow."""
+CHANGED_CHI2 = 27.86
+"""Least chi-squared of changed extrinsics: a chance of 1e-4, as of explanations."""
 # Smallest part along an eigen-direction that is named, standard deviations.
 _NAMED_SIGMAS = 2.0
 # Beyond some radius the distortion is undefined; corners are moved to that radius.
-_INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
+_INWARDS = np.arange(40) / 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,11 @@ class JointDifference(PoseDifference):
     """
 
     lever_m: float
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether the difference is a change beyond chance."""
+        return self.chi2 > CHANGED_CHI2
 
     @property
     def significant(self) -> Array:

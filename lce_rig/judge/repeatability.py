@@ -13,7 +13,6 @@ from lce_rig.core.geometry import (
     Array,
     chance_of,
     difference,
-    invert,
     mean_pose,
     tangent_sizes,
 )
@@ -38,8 +37,6 @@ class PairDifference:
         distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them;
             for results of the same captures with 2 (cov_1 + cov_2).
         p: probability that correct calibrations differ this much or more.
-        displacements_m: by distance from the camera, both m: how far apart they place a point in the middle
-            of the image, where boards were near and far; empty where their distances are not known.
         axes: those of the most significant part of the difference.
     """
 
@@ -49,7 +46,6 @@ class PairDifference:
     translation_m: float
     distance: float
     p: float
-    displacements_m: Mapping[float, float]
     axes: tuple[str, ...]
 
 
@@ -164,12 +160,12 @@ def compare_calibrations(
     factor = 1.0 if are_independent else 2.0
     differences = []
     for i, j in pairs:
-        apart_m = _displacements(calibrations[names[i]], calibrations[names[j]])
-        lever_m = float(np.mean(list(apart_m))) if apart_m else _LEVER_M
+        distances_m = [d for k in (i, j) for d in calibrations[names[k]].board_distances_m]
+        lever_m = float(np.mean(distances_m)) if distances_m else _LEVER_M
         apart = JointDifference(difference(T[i], T[j]), factor * (cov[i] + cov[j]), lever_m)
         distance, sizes = float(np.sqrt(apart.chi2)), tangent_sizes(apart.tangent)
         differences.append(
-            PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart_m, apart.main_axes)
+            PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart.main_axes)
         )
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
@@ -203,21 +199,6 @@ def compare_calibrations(
         odd_one=blamed[0] if len(blamed) == 1 else None,
         are_independent=are_independent,
     )
-
-
-def _displacements(first: Calibration, second: Calibration) -> dict[float, float]:
-    """Compute the distance between a point by two results, at the near and far distance of both boards.
-
-    Rotation and translation of a result compensate each other at its boards; a difference there remains with
-    any method.
-    """
-    distances = zip(first.board_distances_m, second.board_distances_m, strict=False)
-    from_first = second.T_cam_lidar @ invert(first.T_cam_lidar)
-    found = {}
-    for distance_m in (float(np.mean(pair)) for pair in distances):
-        point = np.array([0.0, 0.0, distance_m, 1.0])
-        found[round(distance_m, 1)] = float(np.linalg.norm((from_first @ point - point)[:3]))
-    return found
 
 
 def _spread(T: Array, cov: Array) -> float:

@@ -31,8 +31,6 @@ from lce_rig.scene.findings import (
 )
 from lce_rig.scene.outline_score import OutlineScore, OutlineView
 
-CHANGED_CHI2 = 27.86
-"""Least chi-squared of changed extrinsics: a chance of 1e-4."""
 _MIN_GAIN = 2.0  # Significance of a change if several fit about equally well.
 _OPINIONS: dict[State, Opinion] = {"changed": "contradicts", "unchanged": "agrees", "unknown": "unknown"}
 _LEVER_M = float(REACH[0] / REACH[3])  # makes angles comparable with distances
@@ -102,7 +100,7 @@ class SceneDrift:
             return FEW_EDGES(n_edges=estimate.n_edges, n_captures=self.n_captures)
         if not self._is_located:
             return (WEAK if estimate.state == "weak" else BEYOND_REACH)()
-        if self.change.chi2 > CHANGED_CHI2:
+        if self.change.is_changed:
             if estimate.state == "usable":
                 return CHANGED(**self.change.figures)
             return (ELSEWHERE if self.gain > _MIN_GAIN else AMBIGUOUS)(**self.change.sizes)
@@ -172,7 +170,7 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
     c = calibration
     estimate = estimate_scene(views, lens, c.T_cam_lidar)
     drift = SceneDrift(c.T_cam_lidar, c.cov, estimate, len(views))
-    if estimate.state == "ambiguous" and drift.change.chi2 > CHANGED_CHI2:
+    if estimate.state == "ambiguous" and drift.change.is_changed:
         drift = replace(drift, gain=_gain(views, lens, estimate.T_cam_lidar, c.T_cam_lidar))
     return drift
 

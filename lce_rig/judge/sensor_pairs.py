@@ -16,7 +16,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
-from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
+from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
@@ -33,14 +33,12 @@ from lce_rig.core.geometry import (
 )
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import LidarDetection
-from lce_rig.judge.explanations import find_change
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
     EXCHANGED,
     FAIL_FACTOR,
     LIDARS_DIFFER,
     LIDARS_UNNAMED,
-    MOVED,
     OTHER_MODEL,
     failing,
 )
@@ -64,20 +62,12 @@ class RelativePose:
         T_second_first: (4, 4), p_second = R p_first + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
             between placements.
-        captures: (F,) that both cameras used, as the first names them.
         board_rms_m: rms distance between both cameras' positions of a board's middle.
-        scatter: scatter of single boards about it, in typical standard deviations of poses in images.
-        expansion: expansion of the cost about T_second_first, per capture.
-        centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
     T_second_first: Array
     cov: Array
-    captures: tuple[str, ...]
     board_rms_m: float
-    scatter: float
-    expansion: Quadratics
-    centres: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,15 +110,18 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     shared = shared_boards(first.observations, second.observations)
     if not shared:
         return None
-    T, J = relative_pose(second.T_cam_lidar, first.T_cam_lidar)
+    T = second.T_cam_lidar @ invert(first.T_cam_lidar)
     from_images = pose_from_images(shared)
     captures = tuple(one.capture for one, _ in shared)
     board_rms_m = _board_rms_m(shared, T)
     if from_images is None:
         return CameraPair(captures, None, None, board_rms_m)
     # Errors of the images enter both poses and are counted twice, which is conservative.
-    cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
-    apart = PoseDifference(difference(from_images.T_second_first, T), cov)
+    apart = _close_loop(
+        (from_images.T_second_first, from_images.cov),
+        (first.T_cam_lidar, first.cov),
+        (second.T_cam_lidar, second.cov),
+    )
     return CameraPair(captures, from_images, apart, board_rms_m)
 
 
@@ -148,29 +141,21 @@ def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> Relat
     T_second, cov_second = _poses(seconds)
     T, J = relative_pose(T_second, T_first)
     information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
-    # Start at the pose with the least median of squared distances (F, F) to all.
-    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
-    distances = np.einsum("mki,kij,mkj->mk", apart, information, apart)
-    middle = T[int(np.argmin(np.median(distances, axis=1)))]
 
     def weigh(chi2: Array) -> Array:
         """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
         return student_weights(chi2 / max(float(np.median(chi2)) / 6, 1.0))
 
-    mean, weight = mean_pose(T, information, middle, weigh)
+    mean, weight = mean_pose(T, information, weigh=weigh)
     apart = difference(T, mean)
-    chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
-    hessians = weight[:, None, None] * information
-    gradients = -(hessians @ apart[..., None])[..., 0]
-    expansion = without_prior(gradients, hessians, placement)
-    scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
+    hessians, none = weight[:, None, None] * information, np.zeros((6, 6))
+    expansion = Quadratics(-(hessians @ apart[..., None])[..., 0], hessians, none, none[0], placement)
     if len(expansion.groups) < _MIN_JACKKNIFE:
-        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
+        scatter = float(np.einsum("ki,kij,kj->", apart, information, apart)) / (6 * (len(T) - 1))
+        cov = max(scatter, 1.0) * expansion.covariance()
     else:
         cov = expansion.jackknife_covariance()
-    captures = tuple(one.capture for one in firsts)
-    board_rms_m = _board_rms_m(shared, mean)
-    return RelativePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
+    return RelativePose(mean, cov, _board_rms_m(shared, mean))
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
@@ -229,7 +214,7 @@ def find_exchanged_cameras(
             check_intrinsics(each.views, lens, board)
             for each, lens in zip((first, second), lenses, strict=True)
         ]
-        if all(check is not None and check.verdict() == "pass" for check in checks):
+        if all(check is not None and check.fits() for check in checks):
             reasons.append("lenses")
     return [EXCHANGED(f"{first.name} and {second.name}", fits=tuple(reasons))] if reasons else []
 
@@ -260,40 +245,18 @@ def camera_findings(pair: CameraPair, names: tuple[str, str], target: Calibratio
     """
     if pair.from_images is None or pair.apart is None:
         return []
-    seen = pair.from_images
-    cameras, findings = " to ".join(names), []
-    change = find_change(seen.expansion)
-    if change is not None:
-        rotation_deg, translation_m = tangent_sizes(change.value)
-        size = target.in_targets(rotation_deg, translation_m)
-        if size > 1:
-            cut, is_own = change.explanation.cut, change.explanation.weights > 0
-            findings.append(
-                MOVED(
-                    cameras,
-                    severity=failing(size > FAIL_FACTOR),
-                    captures=tuple(name for name, own in zip(seen.captures, is_own, strict=True) if own),
-                    n_captures=int(is_own.sum()),
-                    place="first" if is_own[0] else "last",
-                    neighbour=seen.captures[cut if is_own[0] else cut - 1],
-                    rotation_deg=rotation_deg,
-                    translation_m=translation_m,
-                    chance=float(10.0**change.log10_chance),
-                )
-            )
-    images_rms_m = pair.from_images.board_rms_m
     excess = target.excess(pair.apart)
-    if excess > 1:
-        findings.append(
-            CAMERAS_DIFFER(
-                cameras,
-                severity=failing(excess > FAIL_FACTOR),
-                rms_m=pair.board_rms_m,
-                images_rms_m=images_rms_m,
-                **pair.apart.sizes,
-            )
+    if excess <= 1:
+        return []
+    return [
+        CAMERAS_DIFFER(
+            " to ".join(names),
+            severity=failing(excess > FAIL_FACTOR),
+            rms_m=pair.board_rms_m,
+            images_rms_m=pair.from_images.board_rms_m,
+            **pair.apart.sizes,
         )
-    return findings
+    ]
 
 
 def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetection]) -> list[Finding]:
@@ -368,10 +331,7 @@ def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
 
     All three results have seen the same boards: their errors are counted as independent.
     """
-    (T_first, cov_first), (T_between, cov_between), (T_second, cov_second) = loop[1:]
-    by_first, by_between = composition_slopes(T_first, T_between)
-    cov = by_first @ cov_first @ by_first.T + by_between @ cov_between @ by_between.T + cov_second
-    apart = PoseDifference(difference(T_first @ T_between, T_second), cov)
+    apart = _close_loop(loop.first, loop.between, loop.second)
     excess = target.excess(apart)
     if excess <= 1:
         return []
@@ -381,3 +341,12 @@ def loop_findings(loop: Loop, target: CalibrationSettings) -> list[Finding]:
             " and ".join(lidars), severity=failing(excess > FAIL_FACTOR), camera=camera, **apart.sizes
         )
     ]
+
+
+def _close_loop(
+    first: tuple[Array, Array], between: tuple[Array, Array], second: tuple[Array, Array]
+) -> PoseDifference:
+    """Compare the pose `first @ between` (4, 4) with `second`, each with its covariance (6, 6)."""
+    by_first, by_between = composition_slopes(first[0], between[0])
+    cov = by_first @ first[1] @ by_first.T + by_between @ between[1] @ by_between.T + second[1]
+    return PoseDifference(difference(first[0] @ between[0], second[0]), cov)

@@ -10,7 +10,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.judge.causes import cause_findings, contradiction_of, find_causes, hypothesis_of, is_explained
+from lce_rig.judge.causes import find_causes, hypothesis_of, is_explained, report_causes
 from lce_rig.judge.contributions import (
     OF_BOARD,
     channels_contradict,
@@ -74,11 +74,8 @@ def validate(
     intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)
     hypothesis = hypothesis_of(estimate, rejected)
     selected = () if hypothesis is None else find_causes(hypothesis, estimate, rig.calibration, tested)
-    causes = cause_findings(selected, estimate, rig, camera, lidar)
-    contradictions = [
-        *contradiction_of(selected, causes, estimate.used),
-        *channels_contradict(estimate, rig.calibration),
-    ]
+    causes, contradictions = report_causes(selected, estimate, rig, camera, lidar)
+    contradictions += channels_contradict(estimate, rig.calibration)
     cov_agreed = estimate.cov + summed_covariance(known)
     return Validation(
         cov=cov_agreed + summed_covariance(contradictions),

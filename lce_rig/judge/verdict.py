@@ -65,7 +65,7 @@ MAX_PLANE_MISFIT_M = 0.012
 """Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
 reach 20 to 30 mm."""
 # Least chi-squared, of six degrees of freedom, of a scene that fails a result: a chance of 6e-7, as of 5
-# standard deviations of one quantity. A contradiction below it, from `CHANGED_CHI2` on, is a warning.
+# standard deviations of one quantity. A smaller contradiction is a warning.
 SCENE_FAILS_CHI2 = 39.5
 
 

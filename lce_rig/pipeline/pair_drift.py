@@ -85,7 +85,7 @@ class PairDrift:
         """The finding that the boards exclude the scene's change, if they do."""
         if self.board is None or (self.drift.state, self.board.state) != ("changed", "unchanged"):
             return []
-        scene, board = self.drift.change, self.board.joint
+        scene, board = self.drift.change, self.board
         apart = PoseDifference(scene.tangent - board.tangent, scene.cov + board.cov)
         return [CONTRADICTION(**apart.sizes)] if apart.chi2 > HOLDS_CHI2 else []
 

@@ -171,8 +171,8 @@ def verify(
                         {key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]}
                     )
                     watched = watch_boards(session.rig, c, channel, alone)
-                    if watched is not None and watched.joint.is_changed:
-                        check = replace(check, findings=(watched.joint.finding, *check.findings))
+                    if watched is not None and watched.state == "changed":
+                        check = replace(check, findings=(watched.findings[0], *check.findings))
                 checks.append(check)
     if all(check.metrics is None for check in checks) and any(not c.is_with_board for c in calibrations):
         raise SessionError(

@@ -4,7 +4,6 @@ from lce_rig.core.findings import Kind
 
 _BOARD = "collect a session with the board and calibrate it"
 _FASTEN = f"fasten the sensors, {_BOARD}"
-_UNSEEN = "changes below {smallest:size} would not be seen"
 _SEEN = "changes from {smallest_deg:deg}, {smallest_m:mm} would be seen"
 _RECORD = "record furniture, doors or people that stand before something farther off"
 
@@ -58,9 +57,6 @@ BEYOND_REACH = Kind(
     _BOARD,
     severity="warning",
 )
-BOARD_CHANGED = Kind(
-    "scene.board_changed", "board, {subject:motion}: changed by {change:+size} +- {sigma:size}"
-)
 BOARD_CHANGED_JOINTLY = Kind(
     "scene.board_changed_jointly",
     "boards: all axes together changed by {rotation_deg:deg}, {translation_m:mm}, {sigmas:.1f} standard "
@@ -71,12 +67,6 @@ BOARD_HIDES = Kind(
     "scene.board_hides",
     "boards: {rotation:motion} by {rotation_deg:deg} with {translation:motion} by {translation_m:mm}, "
     "or less, would not be seen",
-    severity="note",
-)
-BOARD_UNSURE = Kind(
-    "scene.board_unsure",
-    "board, {subject:motion}: " + _UNSEEN,
-    "hold the board at more places",
     severity="note",
 )
 CONTRADICTION = Kind(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse, without_prior
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
 
 
 def sample_regressions(n_groups, n_trials, seed=0):
@@ -17,7 +17,7 @@ def sample_regressions(n_groups, n_trials, seed=0):
         estimate = np.linalg.solve(hessians.sum(axis=0), right.sum(axis=0))
         gradients = (design.swapaxes(1, 2) @ (design @ estimate - noise)[..., None])[..., 0]
         errors.append(estimate)
-        cost = without_prior(gradients, hessians, np.arange(n_groups))
+        cost = Quadratics(gradients, hessians, np.zeros((3, 3)), np.zeros(3), np.arange(n_groups))
         covariances.append(cost.jackknife_covariance())
     return np.array(errors), np.array(covariances)
 
@@ -45,7 +45,7 @@ def test_leave_one_out_shifts_match_refits():
     estimate = fit(group >= 0)
     gradients = np.einsum("fni,fn->fi", A, A @ estimate - b)
     hessians = np.swapaxes(A, 1, 2) @ A
-    cost = without_prior(gradients, hessians, group)
+    cost = Quadratics(gradients, hessians, np.zeros((3, 3)), np.zeros(3), group)
     moves = cost.moves()
     anew = np.array([fit(group != k) for k in range(4)])
     np.testing.assert_allclose(estimate + moves, anew, atol=1e-12)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, State
+from lce_rig.core.calibration import MOTIONS, Calibration, State
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.board_drift import AxisDrift, BoardDrift, JointDrift, watch_boards
+from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.judge.scene_drift import SceneDrift
 from lce_rig.pipeline.pair_drift import PairDrift
 from lce_rig.rig import load_rig
@@ -41,8 +41,8 @@ def test_board_drift_hidden_rotation_is_seen() -> None:
     hidden = np.array([0, 0.05, 0, np.radians(1.01), 0, 0])
     for seed in range(3):
         board = watched(deployed(hidden), seed)
-        assert board.joint.is_changed
-        assert {"translation_y", "rotation_x"} & set(board.joint.axes)
+        assert board.state == "changed"
+        assert {"translation_y", "rotation_x"} & set(board.main_axes)
         assert "scene.board_changed_jointly" in [finding.code for finding in board.findings]
 
 
@@ -50,17 +50,9 @@ def test_board_drift_hidden_rotation_is_seen() -> None:
 def test_board_drift_unchanged_extrinsics_pass(seeds: range) -> None:
     for seed in seeds:
         board = watched(deployed(np.zeros(6)), seed)
-        assert (board.joint.is_changed, board.joint.axes) == (False, ())
+        assert board.state == "unchanged"
         # Directions that boards do not determine are a note.
         assert [f.severity for f in board.findings if f.code == "scene.board_hides"] == ["note"]
-
-
-def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
-    found = []
-    for axis in MOTIONS:
-        state, change = states.get(axis, ("unchanged", 0.0))
-        found.append(AxisDrift(axis, state, change, 0.16, 0.7))
-    return tuple(found)
 
 
 @pytest.mark.parametrize(("board_deg", "state"), [(0.10, "unknown"), (0.9, "changed")])
@@ -69,10 +61,7 @@ def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float,
     change, cov = np.radians(1.2) * np.eye(6)[5], np.diag(SIGMAS**2)
     estimate = SceneEstimate(perturb(T_FORWARD, change), cov, "usable", 0.3, 5.0, 15, 4000, REACH)
     drift = SceneDrift(T_FORWARD, cov, estimate, 15)
-    joint = JointDrift(np.radians(board_deg) * np.eye(6)[5], 4 * cov, 2.5)
-    boards = BoardDrift(
-        axes({"rotation_z": ("unchanged", board_deg)}), Metrics(0.01, 0.01, 0.1), 15, 15, joint
-    )
+    boards = BoardDrift(np.radians(board_deg) * np.eye(6)[5], 4 * cov, 2.5, 15, 15)
     pair = PairDrift(calibration, drift, boards, None)
     assert pair.state == state
     assert (pair.findings[0].code == "scene.contradiction") == (state == "unknown")
@@ -88,26 +77,25 @@ def test_watch_boards_one_outlier_keeps_the_verdict() -> None:
         RIG, calibration, "frames", Detections({key: {**images, name: shifted}}, {lidar: scans})
     )
     assert board is not None
-    assert (board.n_boards, board.joint.is_changed) == (14, False)
-    assert {axis.state for axis in board.axes} == {"unchanged"}
+    assert (board.n_boards, board.state) == (14, "unchanged")
 
 
 @pytest.mark.parametrize("axis", range(6))
 def test_watch_boards_moved_sensor_measures_the_change(axis: int) -> None:
     change = np.where(axis == np.arange(6), np.repeat([0.08, np.radians(3.0)], 3), 0.0)
     board = watched(deployed(-change), 2)
-    error = board.joint.tangent - change
-    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(board.joint.cov)))
-    assert board.axes[axis].state == "changed"
-    assert MOTIONS[axis] in board.joint.axes
+    error = board.tangent - change
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(board.cov)))
+    assert board.state == "changed"
+    assert MOTIONS[axis] in board.main_axes
 
 
-def test_joint_drift_names_pitch_with_height() -> None:
+def test_board_drift_names_pitch_with_height() -> None:
     # Boards at one distance of 2.5 m see the sum of a height and 2.5 m times a pitch.
     inverse = np.diag(np.r_[np.full(3, 0.01), np.radians([0.1, 0.1, 0.1])] ** -2)
     seen = np.array([0.0, 1.0, 0.0, 2.5, 0.0, 0.0])
     pair = np.ix_([1, 3], [1, 3])
     inverse[pair] = np.outer(seen, seen)[pair] / 0.002**2 + np.diag([0.5**-2, 0.2**-2])
-    joint = JointDrift(np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0]), np.linalg.inv(inverse), 2.5)
-    assert joint.axes == ("translation_y", "rotation_x")
-    assert joint.finding.figures["translation_m"] == pytest.approx(0.03, abs=0.001)
+    board = BoardDrift(np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0]), np.linalg.inv(inverse), 2.5, 15, 15)
+    assert board.main_axes == ("translation_y", "rotation_x")
+    assert board.findings[0].figures["translation_m"] == pytest.approx(0.03, abs=0.001)

@@ -59,20 +59,6 @@ def test_consistent_sessions_have_no_findings(sound):
         assert findings(pair) == []
 
 
-@pytest.mark.parametrize(
-    ("nudge", "figure", "size"),
-    [(TURNED, "rotation_deg", 0.5), (np.array([0.02, 0, 0, 0, 0, 0]), "translation_m", 0.024)],
-    ids=["turned", "shifted"],
-)
-@pytest.mark.parametrize("seed", range(2))
-def test_images_nudged_camera_is_found(seed, nudge, figure, size):
-    found = findings(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
-    (change,) = (finding for finding in found if finding.code == "verdict.moved")
-    assert change.subject.split(" to ") == [LEFT, RIGHT]
-    assert (change.figures["place"], change.figures["neighbour"]) == ("last", "000005")
-    assert change.figure(figure) == pytest.approx(size, rel=0.25)
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_stale_extrinsics_contradict_images(seed):
     """Extrinsics from before the camera was rotated, and captures of both cameras from after it."""
@@ -86,7 +72,7 @@ def test_stale_extrinsics_contradict_images(seed):
     assert 0.025 < apart.figure("rms_m") < 0.055
 
 
-def test_scaled_lens_scatters_the_boards():
+def test_scaled_lens_moves_the_boards():
     session = observed(simulate_two(12, 0))
     longer = []
     for left, right in session:
@@ -94,7 +80,6 @@ def test_scaled_lens_scatters_the_boards():
         T[:3, 3] *= 1.03
         longer.append((left, replace(right, pose=replace(right.image, T_cam_board=T))))
     plain, scaled = (pose_from_images(each) for each in (session, longer))
-    assert plain.scatter < 2 < scaled.scatter
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
 
 

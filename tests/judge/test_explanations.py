@@ -9,9 +9,8 @@ from scipy.stats import chi2 as chi_squared
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
 from lce_rig.calibrate.options import Tolerances
-from lce_rig.calibrate.quadratics import without_prior
 from lce_rig.core.geometry import Array, fit_plane, perturb, tangent_sizes
-from lce_rig.judge.explanations import ALL, Table, explain, find_change, log10_chance
+from lce_rig.judge.explanations import ALL, Table, explain, log10_chance
 from lce_rig.lens.models import LensPrior
 from tests.calibrate.boards import BOARD, CAMERA, Scenario, simulate
 
@@ -192,20 +191,6 @@ def test_table_chances_of_sound_captures_are_uniform():
         ]
     assert np.mean(np.array(chances) < -1) < 0.2
     assert min(chances) > -4
-
-
-def test_find_change_of_poses_needs_no_known_noise():
-    rng = np.random.default_rng(1)
-    x = rng.standard_normal((20, 6)) * 0.01
-    hessians = np.tile(np.eye(6) * 1e6, (20, 1, 1))
-
-    def cost(shift):
-        tangents = x + np.outer(np.arange(20) >= 12, shift)
-        return without_prior(-np.einsum("kij,kj->ki", hessians, tangents), hessians, np.arange(20))
-
-    assert find_change(cost(np.zeros(6))) is None
-    found = find_change(cost(np.array([0.05, 0, 0, 0, 0.05, 0])))
-    assert found is not None and found.explanation.cut == 12
 
 
 @pytest.mark.parametrize("freedoms", [1, 6, 40])

@@ -257,8 +257,7 @@ def test_drift_board_in_view_is_evaluated(room, turned):
         (pair,) = drift(room, result).pairs
         assert pair.state == state
         if pair.board is not None:
-            yaw = pair.board.axes[MOTIONS.index("rotation_y")]
-            assert yaw.state == state and yaw.change == pytest.approx(
-                {"unchanged": 0.0, "changed": -2.0}[state], abs=3 * yaw.sigma
-            )
+            yaw, turned_deg = MOTIONS.index("rotation_y"), {"unchanged": 0.0, "changed": -2.0}[state]
+            error = pair.board.tangent[yaw] - np.radians(turned_deg)
+            assert pair.board.state == state and abs(error) < 3 * np.sqrt(pair.board.cov[yaw, yaw])
     assert pair.board is not None and pair.board.n_boards == 4
