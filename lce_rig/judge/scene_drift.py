@@ -15,8 +15,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
 from lce_rig.judge.reach import JointDifference
-from lce_rig.scene.edge_pyramid import SIGMAS_RAD
-from lce_rig.scene.estimate import HOLDS_CHI2, REACH, SceneEstimate, estimate_scene, significance
+from lce_rig.scene.estimate import HOLDS_CHI2, MIN_GAIN, REACH, SceneEstimate, estimate_scene, gain_over
 from lce_rig.scene.findings import (
     AMBIGUOUS,
     BEYOND_REACH,
@@ -29,9 +28,8 @@ from lce_rig.scene.findings import (
     UNKNOWN,
     WEAK,
 )
-from lce_rig.scene.outline_score import OutlineScore, OutlineView
+from lce_rig.scene.outline_score import OutlineView
 
-_MIN_GAIN = 2.0  # Significance of a change if several fit about equally well.
 _OPINIONS: dict[State, Opinion] = {"changed": "contradicts", "unchanged": "agrees", "unknown": "unknown"}
 _LEVER_M = float(REACH[0] / REACH[3])  # makes angles comparable with distances
 
@@ -69,7 +67,7 @@ class SceneDrift:
         cov: (6, 6) of these.
         estimate: estimate of the scene.
         n_captures: compared.
-        gain: significance of an ambiguous estimate's score over that of the deployed extrinsics.
+        gain: significance of a changed estimate's score over that of the deployed extrinsics.
         others: further findings; clocks apart prevent an all-clear.
     """
 
@@ -101,9 +99,11 @@ class SceneDrift:
         if not self._is_located:
             return (WEAK if estimate.state == "weak" else BEYOND_REACH)()
         if self.change.is_changed:
-            if estimate.state == "usable":
-                return CHANGED(**self.change.figures)
-            return (ELSEWHERE if self.gain > _MIN_GAIN else AMBIGUOUS)(**self.change.sizes)
+            if self.gain < MIN_GAIN:
+                return AMBIGUOUS(**self.change.sizes)
+            if estimate.state == "ambiguous":
+                return ELSEWHERE(**self.change.sizes)
+            return CHANGED(**self.change.figures)
         if np.any(np.array([smallest_m, np.radians(smallest_deg)]) > REACH[[0, 3]]):
             return UNKNOWN(**sizes)
         return (DOUBTFUL if self.change.chi2 > HOLDS_CHI2 else UNCHANGED)(**sizes)
@@ -170,12 +170,6 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
     c = calibration
     estimate = estimate_scene(views, lens, c.T_cam_lidar)
     drift = SceneDrift(c.T_cam_lidar, c.cov, estimate, len(views))
-    if estimate.state == "ambiguous" and drift.change.is_changed:
-        drift = replace(drift, gain=_gain(views, lens, estimate.T_cam_lidar, c.T_cam_lidar))
-    return drift
-
-
-def _gain(views: Sequence[OutlineView], lens: Intrinsics, T_best: Array, T_other: Array) -> float:
-    """Compute the significance, by blocks of the image, of the score of extrinsics over that of others."""
-    best, other = (OutlineScore(views, lens, T, len(SIGMAS_RAD) - 1) for T in (T_best, T_other))
-    return significance(best, np.zeros(6), other, np.zeros(6))
+    if not drift.change.is_changed:
+        return drift
+    return replace(drift, gain=gain_over(estimate, views, lens, c.T_cam_lidar, c.cov))
