@@ -191,7 +191,7 @@ class Reduced:
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
-        minus_2_log_likelihood: -2 ln p(data, unknowns | levels) at the optimum, up to a constant.
+        minus_2_log_likelihood: -2 ln p(data, z | levels) at the optimum of z, the own unknowns integrated out.
     """
 
     cost: Quadratics
@@ -359,9 +359,10 @@ def eliminate(summed: Summed, trust: Array, n_own: int, known: Known) -> Reduced
     information, gradient = cost.information, gradients.sum(axis=0) + cost.prior_gradient
     least = costs.sum() + off @ cost.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
-    likelihood = float(least + log_volume)
-    log_volume += float(trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
-    return Reduced(cost, np.asarray(steps), of_own, float(least + log_volume + known.log_volume), likelihood)
+    # Profiled over own unknowns, the likelihood would grow without bound as a noise level falls.
+    likelihood = float(least + log_volume + trust @ np.linalg.slogdet(of_own)[1])
+    evidence = likelihood + float(np.linalg.slogdet(information)[1]) + known.log_volume
+    return Reduced(cost, np.asarray(steps), of_own, evidence, likelihood)
 
 
 def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
