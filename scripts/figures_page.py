@@ -23,6 +23,7 @@ PAGES = tuple(
         "README.md",
         "docs/benchmarks.md",
         "docs/how-accuracy-was-tested.md",
+        "docs/intrinsics.md",
         "docs/without-a-board.md",
     )
 )

@@ -15,7 +15,6 @@ from lce_rig.cli.options import (
     names_option,
     path_option,
     require_sensors,
-    session_argument,
 )
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.phrasing import as_line
@@ -32,7 +31,7 @@ from lce_rig.session import Session
 
 
 @click.command()
-@session_argument
+@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="[SESSION]...")
 @cameras_option
 @names_option(
     "--channels", "Use these channels together, as they share the lens [default: those of kind frames]."
@@ -45,13 +44,13 @@ from lce_rig.session import Session
 @path_option(
     "--save-profile",
     "FILE",
-    "Write the session's profile to a new file, with the intrinsics that the session determines better.",
+    "Write the first session's profile to a new file, with the intrinsics that the boards determine better.",
 )
 @click.option("--force", is_flag=True, help="With --save-profile: write all estimated intrinsics.")
 @explain_option
 @json_option
 def intrinsics(
-    session: Path,
+    sessions: tuple[Path, ...],
     cameras: tuple[str, ...],
     channels: list[str] | None,
     model: str | None,
@@ -60,13 +59,17 @@ def intrinsics(
     explain: bool,
     as_json: bool,
 ) -> None:
-    """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
+    """Estimate each camera's intrinsics from the boards in the images of SESSIONs (default: session/).
 
     Reports whether the profile's intrinsics still fit, and the weaknesses of the captures. Writes
-    a camera_info file for each camera into SESSION/intrinsics/. Exits with 6 if the captures are
-    insufficient, with 7 if --save-profile has nothing better than the profile to write.
+    a camera_info file for each camera into intrinsics/ of the first SESSION. Exits with 6 if the
+    captures are insufficient, with 7 if --save-profile has nothing better than the profile to write.
+
+    Sessions of one camera share its lens: with the profile of all of them (--save-profile FILE
+    --force, then `calibrate --rig FILE`) their extrinsics differ less.
     """
-    opened = Session.open(session)
+    every = [Session.open(path) for path in sessions or (Path("session"),)]
+    opened, session = every[0], every[0].path
     require_sensors("camera", cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
@@ -75,7 +78,7 @@ def intrinsics(
         try:
             with show.progress_bar(f"detecting in {camera}") as progress:
                 measured.append(
-                    measure_intrinsics(opened, camera, channels=wanted, model=model, progress=progress)
+                    measure_intrinsics(every, camera, channels=wanted, model=model, progress=progress)
                 )
         except NotEnoughDataError as error:
             troubles.append(error)
@@ -88,8 +91,8 @@ def intrinsics(
     else:
         for one in measured:
             is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
-            advice = "" if is_followed else one.judgement.advice_at(str(session))
-            show.print_parts(_parts(one, advice, show.command("intrinsics", session, " --explain")))
+            advice = "" if is_followed else one.judgement.advice_at(*(str(each.path) for each in every))
+            show.print_parts(_parts(one, advice))
     if explain and not as_json:
         show.print_figures(described)
     show.note(f"  files        {files[0].parent}/: {', '.join(path.name for path in files)}")
@@ -105,13 +108,12 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[str]:
+def _parts(measured: MeasuredIntrinsics, advice: str) -> Iterator[str]:
     """State the judgement with its action, the fit, the intrinsics and the main weakness.
 
     Args:
         measured: estimated intrinsics of one camera.
         advice: the action, or "".
-        whole: the command that explains all.
     """
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.covered:.0f}"
@@ -131,7 +133,7 @@ def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[st
         weaknesses = [text for text in measured.weaknesses if text not in judgement.sentence]
         yield from (f"  [yellow]{show.escape(text)}[/]" for text in weaknesses[:1])
         if len(weaknesses) > 1:
-            yield f"  {len(weaknesses) - 1} more: {whole}"
+            yield f"  {len(weaknesses) - 1} more: with --explain"
 
 
 @click.command(name="lidar-intrinsics")

@@ -127,9 +127,9 @@ class Finding:
         kind = KINDS[self.code]
         return self._render(kind.actions[self.action] if self.action else kind.action)
 
-    def advice_at(self, session: str) -> str:
-        """Return the action as text, with the path of the session in its commands."""
-        placed = replace(self, figures={**self.figures, "session": shlex.quote(session)}, stored=None)
+    def advice_at(self, *sessions: str) -> str:
+        """Return the action as text, with the paths of the sessions in its commands."""
+        placed = replace(self, figures={**self.figures, "session": shlex.join(sessions)}, stored=None)
         try:
             return placed.advice
         except (KeyError, TypeError, ValueError, AssertionError):

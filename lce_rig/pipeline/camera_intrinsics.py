@@ -1,4 +1,4 @@
-"""A camera's intrinsics from a session's images of the board, as camera_info and as a new profile."""
+"""A camera's intrinsics from the images of the board in sessions, as camera_info and as a new profile."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ from lce_rig.session.durable import replacing, write_atomically
 from lce_rig.session.session import INTRINSICS
 
 Key = tuple[str, str]
-"""Capture and channel of an image."""
+"""Capture and channel of an image; of several sessions, the capture's name follows its session's."""
 # A typical field of view, 64 deg, if the profile's intrinsics are unusable.
 _GUESSED_FOCAL = 0.8
 _ANY_REPROJECTION_PX = 1e9
@@ -55,7 +55,7 @@ _ANY_REPROJECTION_PX = 1e9
 
 @dataclass(frozen=True, eq=False)
 class MeasuredIntrinsics:
-    """A camera's intrinsics from the boards of a session, compared with the profile's.
+    """A camera's intrinsics from the boards of sessions, compared with the profile's.
 
     Attributes:
         camera: the camera's name.
@@ -102,7 +102,7 @@ class MeasuredIntrinsics:
 
 
 def measure_intrinsics(
-    session: Session,
+    sessions: Sequence[Session],
     camera: str,
     *,
     channels: Sequence[str] = (),
@@ -115,7 +115,7 @@ def measure_intrinsics(
     again with the fitted ones.
 
     Args:
-        session: session, open for reading.
+        sessions: at least one, open for reading; camera and board are the same in all.
         camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
@@ -123,10 +123,12 @@ def measure_intrinsics(
         progress: called with (done, total).
 
     Raises:
-        UsageError: no such channel or model.
+        UsageError: no such channel or model, or sessions of different cameras or boards.
         NotEnoughDataError: too few images show the board, or the focal length is undetermined.
     """
-    rig = session.rig
+    rig = sessions[0].rig
+    for session in sessions[1:]:
+        _require_same(session, sessions[0], camera)
     if model not in (None, *MODELS):
         raise UsageError(f"unknown lens model {model!r}; choose one of: {', '.join(MODELS)}")
     have = rig.cameras[camera].channels
@@ -136,12 +138,12 @@ def measure_intrinsics(
     frames = tuple(name for name, settings in have.items() if settings.kind == "frames")
     chosen = tuple(dict.fromkeys(channels)) or frames or tuple(have)
     given = rig.cameras[camera].to_intrinsics()
-    jobs, seen_in_events = _images_of(session, camera, chosen)
+    jobs, seen_in_events = _images_of(sessions, camera, chosen)
     start = given
     found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
     if _n_captures(found) < rig.quality.min_captures:
         width, height = given.width_px, given.height_px
-        for capture, channel in jobs:
+        for (_, channel), capture in jobs.items():
             with suppress(SessionError):
                 height, width = capture.image(camera, channel).pixels.shape[:2]
                 break
@@ -160,7 +162,7 @@ def measure_intrinsics(
         or (board.quality is not None and board.quality.n_corners < np.isfinite(board.corners_px[:, 0]).sum())
     }
     if doubtful:
-        again = [(capture, channel) for capture, channel in jobs if (capture.name, channel) in doubtful]
+        again = {key: capture for key, capture in jobs.items() if key in doubtful}
         found |= _look(rig, camera, again, estimate.intrinsics, limit_px, progress)
         estimate = _fit(camera, found, rig, estimate.intrinsics, model)
     lens, target_deg = estimate.intrinsics, rig.calibration.target_sigma_deg
@@ -185,33 +187,53 @@ def measure_intrinsics(
     )
 
 
+def _require_same(session: Session, first: Session, camera: str) -> None:
+    """Refuse a session of another camera or board than the first one's."""
+    if camera not in session.rig.cameras:
+        held = ", ".join(session.rig.cameras)
+        raise UsageError(f"{session.path}: no camera {camera}", f"Choose with --camera of: {held}.")
+    if session.rig.board != first.rig.board:
+        raise UsageError(f"{session.path} has another board than {first.path}", "Give sessions of one board.")
+    lenses = [each.rig.cameras[camera].to_intrinsics() for each in (session, first)]
+    if lenses[0] != lenses[1]:
+        raise UsageError(
+            f"{session.path} has other intrinsics of {camera} than {first.path}",
+            "Calibrate all sessions with one profile first: `lce-rig calibrate SESSION --rig FILE`.",
+        )
+
+
 def _images_of(
-    session: Session, camera: str, channels: Sequence[str]
-) -> tuple[list[tuple[Capture, str]], dict[Key, ImageDetection]]:
-    """List a camera's images in a session, and the boards found in those reconstructed from raw events."""
-    jobs = []
-    for capture in session.captures:
-        # Every channel reports a capture with a damaged manifest.
-        held = [(camera, channel) for channel in channels]
-        with suppress(SessionError):
-            held = capture.image_keys
-        jobs += [(capture, channel) for channel in channels if (camera, channel) in held]
-    pictured = {channel for _, channel in jobs}
-    have = session.rig.cameras[camera].channels
-    of_events = [name for name in channels if have[name].kind == "events" and name not in pictured]
-    in_events = detect_boards(session).images if of_events else {}
-    seen_in_events: dict[Key, ImageDetection] = {
-        (capture, channel): detection
-        for channel in of_events
-        for capture, detection in in_events.get((camera, channel), {}).items()
-    }
+    sessions: Sequence[Session], camera: str, channels: Sequence[str]
+) -> tuple[dict[Key, Capture], dict[Key, ImageDetection]]:
+    """List a camera's images in sessions, and the boards found in those reconstructed from raw events."""
+    jobs: dict[Key, Capture] = {}
+    seen_in_events: dict[Key, ImageDetection] = {}
+    for session in sessions:
+        prefix = "" if len(sessions) == 1 else f"{session.path}/"
+        pictured = set()
+        for capture in session.captures:
+            # Every channel reports a capture with a damaged manifest.
+            held = [(camera, channel) for channel in channels]
+            with suppress(SessionError):
+                held = capture.image_keys
+            own = [channel for channel in channels if (camera, channel) in held]
+            jobs |= {(prefix + capture.name, channel): capture for channel in own}
+            pictured.update(own)
+        have = session.rig.cameras[camera].channels
+        of_events = [name for name in channels if have[name].kind == "events" and name not in pictured]
+        in_events = detect_boards(session).images if of_events else {}
+        seen_in_events |= {
+            (prefix + capture, channel): detection
+            for channel in of_events
+            for capture, detection in in_events.get((camera, channel), {}).items()
+        }
     return jobs, seen_in_events
 
 
 def _look(
     rig: Rig,
     camera: str,
-    jobs: Sequence[tuple[Capture, str]],
+    jobs: Mapping[Key, Capture],
     lens: Intrinsics,
     max_reprojection_px: float,
     progress: Progress,
@@ -219,10 +241,9 @@ def _look(
     """Find the board in images."""
     finder = BoardFinder(rig)
 
-    def find(job: tuple[Capture, str]) -> ImageDetection:
-        capture, channel = job
+    def find(key: Key) -> ImageDetection:
         try:
-            image = capture.image(camera, channel)
+            image = jobs[key].image(camera, key[1])
             return finder.corners(image, lens, max_reprojection_px=max_reprojection_px)
         except SessionError as error:
             return refusal_of("read", error)
@@ -231,8 +252,8 @@ def _look(
 
     found: dict[Key, ImageDetection] = {}
     with ThreadPoolExecutor(2) as pool:
-        for (capture, channel), detection in zip(jobs, pool.map(find, jobs), strict=True):
-            found[capture.name, channel] = detection
+        for key, detection in zip(jobs, pool.map(find, jobs), strict=True):
+            found[key] = detection
             progress(len(found), len(jobs))
     return found
 
@@ -318,10 +339,9 @@ def save_profile(
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]
     if not measured:
-        command = f"lce-rig intrinsics {session.path} --save-profile {path} --force"
         raise ResultRefusedError(
-            f"{path} is not written: the session determines no intrinsics better than the profile",
-            f"To write them nevertheless: {command}",
+            f"{path} is not written: the boards determine no intrinsics better than the profile",
+            "To write them nevertheless, add --force.",
         )
     text = session.profile_text()
     for one in measured:

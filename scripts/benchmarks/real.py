@@ -1,7 +1,7 @@
 """Recordings by others: differences from their references, between halves, and between channels."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -19,7 +19,9 @@ from lce_rig.detect.detection import Detections
 from lce_rig.judge.reach import equivalent_extrinsics
 from lce_rig.judge.repeatability import compare_calibrations
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.rig import Rig
+from lce_rig.pipeline.camera_intrinsics import measure_intrinsics, save_profile
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session
 
 # 95 % of the chi-squared distribution with six degrees of freedom.
 _CHI2_95 = 12.59
@@ -36,13 +38,13 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
     print_head(*head.split(", "), "reported deg / mm", "verdict")
     clocks: list[tuple[object, ...]] = []
     of_one_rig: dict[str, Calibration] = {}
+    sessions: dict[str, tuple[Path, Detections]] = {}
     centres: dict[str, Array] = {}
-    for recorded in SETS:
-        if recorded.is_there and only in recorded.name:
-            with tempfile.TemporaryDirectory() as scratch:
-                session = Path(scratch) / "session"
-                recorded.collect(session)
-                rig, detections = detect(session)
+    with tempfile.TemporaryDirectory() as scratch:
+        for recorded in (each for each in SETS if each.is_there and only in each.name):
+            session = Path(scratch) / recorded.name
+            recorded.collect(session)
+            rig, detections = detect(session)
             for channels in _choices(recorded):
                 print_row(*_row(recorded, rig, detections, channels, n_splits, method))
             if len(recorded.folders) > 1:
@@ -51,16 +53,12 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
                 (calibration, *_), _ = calibrate_detections(rig, detections, EstimateSettings(method))
                 if recorded.name in _ONE_RIG:
                     of_one_rig[recorded.name] = calibration
+                    sessions[recorded.name] = session, detections
                 else:
                     centres[recorded.name] = invert(calibration.T_cam_lidar)[:3, 3]
-    if len(of_one_rig) > 1:
-        print()
-        print_head("sessions of one rig", "apart deg / mm", "boards apart mm, rms")
-        for (name, first), (other, second) in combinations(of_one_rig.items(), 2):
-            apart, boards_mm = _apart(first, second)
-            print_row(f"{name}, {other}", "{:.3f} / {:.1f}".format(*apart), f"{boards_mm:.1f}")
-            measure(f"real.{name}-{other}.{method}.apart", DEG_MM, *apart)
-            measure(f"real.{name}-{other}.{method}.boards", "{:.1f} mm", boards_mm)
+        _print_sessions(of_one_rig, str(method), "each with its own lens")
+        if len(sessions) == len(_ONE_RIG):
+            _print_sessions(_with_one_lens(sessions, method), f"{method}.one_lens", "with the lens of all")
     if len(centres) == len(_CAMERAS):
         baseline_mm = 1000 * float(np.linalg.norm(np.subtract(*centres.values())))
         print(f"\n{' and '.join(_CAMERAS)}: {baseline_mm:.1f} mm apart")
@@ -70,6 +68,30 @@ def bench_real(n_splits: int, only: str, method: Method) -> None:
         print_head("set", "channel", "captures", "corner noise px", "time offset ms")
         for row in clocks:
             print_row(*row)
+
+
+def _print_sessions(of_one_rig: Mapping[str, Calibration], key: str, lens: str) -> None:
+    if len(of_one_rig) < 2:
+        return
+    print()
+    print_head(f"sessions of one rig, {lens}", "apart deg / mm", "boards apart mm, rms")
+    for (name, first), (other, second) in combinations(of_one_rig.items(), 2):
+        apart, boards_mm = _apart(first, second)
+        print_row(f"{name}, {other}", "{:.3f} / {:.1f}".format(*apart), f"{boards_mm:.1f}")
+        measure(f"real.{name}-{other}.{key}.apart", DEG_MM, *apart)
+        measure(f"real.{name}-{other}.{key}.boards", "{:.1f} mm", boards_mm)
+
+
+def _with_one_lens(sessions: Mapping[str, tuple[Path, Detections]], method: Method) -> dict[str, Calibration]:
+    """Calibrate sessions with the profile that `intrinsics` of all of them writes."""
+    opened = [Session.open(path) for path, _ in sessions.values()]
+    profile = opened[0].path / "one_lens.yaml"
+    measured = [measure_intrinsics(opened, camera) for camera in opened[0].rig.cameras]
+    save_profile(opened[0], measured, profile, is_forced=True)
+    rig, found = load_rig(profile), {}
+    for name, (_, detections) in sessions.items():
+        (found[name], *_), _ = calibrate_detections(rig, detections, EstimateSettings(method))
+    return found
 
 
 def _choices(recorded: RecordedSet) -> list[tuple[str, ...]]:

@@ -57,7 +57,7 @@ def session(pictures, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def measured(session):
-    return measure_intrinsics(session, "davis")
+    return measure_intrinsics([session], "davis")
 
 
 def sigmas_off(measured):
@@ -75,7 +75,7 @@ def test_right_intrinsics_are_confirmed(measured):
 
 def test_wrong_intrinsics_lead_to_the_same_lens_and_fail(pictures, tmp_path):
     wrong = {"intrinsics__fx_px": "230.0", "intrinsics__fy_px": "230.0", "intrinsics__distortion": "[]"}
-    measured = measure_intrinsics(session_of(tmp_path / "s", pictures, **wrong), "davis", model="radtan5")
+    measured = measure_intrinsics([session_of(tmp_path / "s", pictures, **wrong)], "davis", model="radtan5")
     assert np.abs(sigmas_off(measured)).max() < 4.5
     assert len(measured.estimate.views) == 8
     assert measured.estimate.rms_px < 0.05
@@ -90,7 +90,7 @@ def test_profile_of_other_resolution_is_accepted(pictures, tmp_path):
     with Session.create(tmp_path / "session", parse_rig(text)) as session:
         for pixels in pictures[:6]:
             session.add_capture([Image("davis", "frames", None, pixels)], [], {})
-    measured = measure_intrinsics(session, "davis")
+    measured = measure_intrinsics([session], "davis")
     assert np.abs(sigmas_off(measured)).max() < 4.5
     assert measured.check is None
     assert measured.judgement.code == "intrinsics.better"
@@ -106,15 +106,41 @@ def test_channels_share_lens_and_bad_images_are_named(pictures, tmp_path):
         for pixels in [*pictures[4:], np.full((260, 346), 90, dtype=np.uint8)]:
             writer.add_capture([Image("davis", "events", None, pixels)], [], {})
     (session.path / "captures" / "000003" / "davis.frames.png").write_bytes(b"torn")
-    both = measure_intrinsics(session, "davis", channels=["frames", "events"])
+    both = measure_intrinsics([session], "davis", channels=["frames", "events"])
     assert [view.channel for view in both.estimate.views] == ["frames"] * 3 + ["events"] * 4
     assert set(both.refused) == {"000003.frames", "000008.events"}
     assert both.refused["000003.frames"].stage == "read"
     assert both.refused["000008.events"].stage == "image"
     assert np.abs(sigmas_off(both)).max() < 4.5
     with pytest.raises(NotEnoughDataError, match="3 of 4") as caught:
-        measure_intrinsics(session, "davis", channels=["frames"])
+        measure_intrinsics([session], "davis", channels=["frames"])
     assert "1 x " in caught.value.hint and "000003" in caught.value.hint
+
+
+def test_sessions_of_one_camera_share_a_lens(pictures, tmp_path):
+    halves = [session_of(tmp_path / name, own) for name, own in (("a", pictures[:4]), ("b", pictures[4:]))]
+    both = measure_intrinsics(halves, "davis")
+    assert len({view.capture for view in both.estimate.views}) == len(pictures)
+    assert np.abs(sigmas_off(both)).max() < 4.5
+    with pytest.raises(NotEnoughDataError, match="4 of 4"):
+        measure_intrinsics(halves[:1], "davis")
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"board.square_m": "0.05"}, "has another board than"),
+        ({"cameras.davis.intrinsics.fx_px": "300.0"}, "has other intrinsics of davis than"),
+    ],
+)
+def test_sessions_of_different_profiles_are_refused(session, pictures, tmp_path, changes, message):
+    text = RLES
+    for key, value in changes.items():
+        text = set_value(text, key, value)
+    with Session.create(tmp_path / "other", parse_rig(text)) as other:
+        other.add_capture([Image("davis", "frames", None, pictures[0])], [], {})
+    with pytest.raises(UsageError, match=message):
+        measure_intrinsics([session, other], "davis")
 
 
 def test_every_file_holds_the_same_lens(session, measured, tmp_path):

@@ -191,7 +191,7 @@ class Reduced:
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
-        minus_2_log_likelihood: -2 ln p(data, z | levels) at the optimum of z, the own unknowns integrated out.
+        minus_2_log_likelihood: -2 ln p(data, z | levels) at the optimum of z, own unknowns integrated out.
     """
 
     cost: Quadratics
