@@ -22,7 +22,7 @@ from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetri
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
-BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
+BACKGROUND_SIGMAS_M = (EDGE_SHIFT_SIGMA_M, 0.01, EDGE_SHIFT_SIGMA_M)
 """Prior standard deviations of the shifts, in the order of `describe_background`."""
 # Prior standard deviations of the extrinsics around which the shifts are estimated.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
