@@ -17,11 +17,12 @@ from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
 _LONGEST_GAP_S = 0.5
 _VOXEL_M = 0.15
-_REACH_M = 0.6  # of the first round of matching
+_REACH_M = 4 * _VOXEL_M  # of the first round of matching
 _ROBUST_M = 0.1  # Residuals above this have little weight: people and cars move differently.
 _MIN_FITNESS = 0.5
 _NORMALS_M = 0.8
-_CLOCKS_S = np.linspace(-0.15, 0.15, 31)
+_LATEST_S = 0.15  # of images after their timestamps, or before
+_CLOCKS_S = np.linspace(-_LATEST_S, _LATEST_S, 31)
 # Smallest time offset not explained by slightly varying motion, s.
 _APART_S = 0.02
 _APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
