@@ -35,7 +35,7 @@ STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
 _SMEARS_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06])
-_OFFSETS_M, _LEAST_SIGMA_M = np.linspace(-SLACK_M, SLACK_M, 41), 0.001
+_OFFSETS_M = np.linspace(-SLACK_M, SLACK_M, 41)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +279,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             weight = np.exp(total - total.max(axis=0))
             weight /= weight.sum(axis=0)
             off = _OFFSETS_M @ weight
-            sigma_m = np.sqrt(np.maximum(_OFFSETS_M**2 @ weight - off**2, _LEAST_SIGMA_M**2))
+            sigma_m = np.sqrt(np.maximum(_OFFSETS_M**2 @ weight - off**2, 0.0))
             n_on = np.bincount(strip[is_on], minlength=n_strips)
             n_beside = np.bincount(strip[~is_on], minlength=n_strips)
             is_seen = (n_on >= 4) & (n_beside >= 4)

@@ -64,8 +64,8 @@ _DARK_SHARE = 0.08
 _FOOT_M = 0.15
 # Range differences of black and white squares, and of glare, reach centimetres at perpendicular incidence.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
-# Limits of another plate: fraction of rays that contradict the best placement, and growth of the outline.
-_MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
+# Growth of the outline above which it is that of another plate.
+_MOST_GROWTH_M = 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
@@ -330,11 +330,6 @@ def measure_unstructured(
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
         return _too_few(n_on, distance_m)
-    if starts[0].error_m > _MOST_MISSES:
-        size_m = np.percentile(view.uv[view.is_on], 98, axis=0) - np.percentile(
-            view.uv[view.is_on], 2, axis=0
-        )
-        return other_plate(size_m / 0.96, distance_m, board)
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
