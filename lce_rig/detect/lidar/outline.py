@@ -26,7 +26,8 @@ N_ANGLES = 9
 # Fraction of rays on the wrong side of any border; with 0, a single ray would decide.
 _OUTLIERS = 0.02
 # Blurs of the first rounds, m, which converge from an inaccurate start; wider ones for a rough start.
-_ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
+_ANNEALED_M = (0.04, 0.02)
+_WIDE_M = tuple(np.geomspace(0.2, _ANNEALED_M[0], 8).tolist())
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
 # Maximum fraction of rays that contradict the placement of a clear plate.
@@ -34,7 +35,7 @@ _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
-_SMEARS_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06])
+_SMEARS_M = np.append(0.0, np.geomspace(0.005, 0.06, 7))
 _OFFSETS_M = np.linspace(-SLACK_M, SLACK_M, 41)
 
 
