@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.algorithm_1.background import HUBER
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import EXACT, LOG_SIGMA, MOST_LOST, Levels, Priors
@@ -37,8 +38,8 @@ _LEVEL_ROUNDS = (8, 4, 8)
 BLURS_RAD = (4e-3, 1.5e-3)
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
-# Huber's constant, in standard deviations of a placement's influence (95 % efficient), and an upper bound.
-_HUBER, _FARTHEST = 1.5, 1e6
+# Largest influence of a placement, in standard deviations: its weight stays above 0.
+_FARTHEST = 1e6
 # Number of plain steps before Anderson mixing, and of steps that it combines.
 _PLAIN, _MIXED = 3, 5
 # Errors of lens and board that `Priors.held` fixes.
@@ -451,7 +452,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
     squares = np.einsum("gi,ij,gj->g", moves, precision, moves)
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
-    return np.asarray((_HUBER / np.clip(z, _HUBER, _FARTHEST))[cost.placement])
+    return np.asarray((HUBER / np.clip(z, HUBER, _FARTHEST))[cost.placement])
 
 
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
