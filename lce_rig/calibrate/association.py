@@ -23,9 +23,9 @@ from lce_rig.core.results import Observation
 _MIN_EXPLAINED, _SHARE = 5, 0.75
 # Minimum number of captures with an error when the others have a consensus.
 _MIN_OF_SOME = 2
-# Reflections of an image, left to right and top to bottom: factors of the camera's axes, then of the board's.
-_MIRRORS = np.array([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, 1.0, 1.0]])
-_IN_PLANE = np.array([-1.0, 1.0, 1.0, 1.0])
+# Reflections of an image, left to right and top to bottom: factors of the camera's axes. The first one's are
+# also those of the board's.
+_MIRRORS = np.array([[-1, 1, 1, 1], [1, -1, 1, 1]])
 
 Candidates = Sequence[Observation]
 
@@ -113,7 +113,7 @@ def _mirrored(item: Observation, mirror: Array) -> Observation:
     """Mirror the board's poses in the image, and the board in its plane."""
 
     def reflected(T_cam_board: Array) -> Array:
-        return np.asarray(mirror[:, None] * T_cam_board * _IN_PLANE)
+        return np.asarray(mirror[:, None] * T_cam_board * _MIRRORS[0])
 
     pose, second = item.pose, item.pose.T_cam_board_alternative
     alternative = None if second is None else reflected(second)

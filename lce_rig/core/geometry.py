@@ -17,6 +17,8 @@ FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
 SIGMA_PER_MAD = 1.4826
 """Standard deviation of normal noise over its median magnitude."""
+SURPRISING_CHI2 = 16.81
+"""Chi-squared, of six degrees of freedom, of poses above which they differ: 99 %."""
 EVEN_STEPS = (1 / 1.2207440846057596) ** np.arange(1, 4)
 """Steps whose multiples, modulo 1, fill a unit cube and each of its axes evenly: powers of 1/g, g^4 = g + 1.
 
@@ -24,8 +26,6 @@ M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
 """
 # Degrees of freedom of the Student distribution that weights poses, as some may be outliers.
 _STUDENT = 5.0
-# 99 % of the chi-squared distribution with six degrees of freedom.
-_SURPRISING_CHI2 = 16.81
 
 
 def skew(v: Array) -> Array:
@@ -234,7 +234,7 @@ class PoseDifference:
     @property
     def is_significant(self) -> bool:
         """Whether a difference this large occurs by chance in at most 1 % of cases."""
-        return self.chi2 > _SURPRISING_CHI2
+        return self.chi2 > SURPRISING_CHI2
 
     @property
     def sizes(self) -> dict[str, float]:

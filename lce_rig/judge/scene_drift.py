@@ -13,9 +13,9 @@ import numpy as np
 from lce_rig.core.calibration import Calibration, Opinion, SceneOpinion, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
+from lce_rig.core.geometry import SURPRISING_CHI2, Array, difference, perturb, tangent_sizes
 from lce_rig.judge.reach import JointDifference
-from lce_rig.scene.estimate import HOLDS_CHI2, MIN_GAIN, REACH, SceneEstimate, estimate_scene, gain_over
+from lce_rig.scene.estimate import MIN_GAIN, REACH, SceneEstimate, estimate_scene, gain_over
 from lce_rig.scene.findings import (
     AMBIGUOUS,
     BEYOND_REACH,
@@ -106,7 +106,7 @@ class SceneDrift:
             return CHANGED(**self.change.figures)
         if np.any(np.array([smallest_m, np.radians(smallest_deg)]) > REACH[[0, 3]]):
             return UNKNOWN(**sizes)
-        return (DOUBTFUL if self.change.chi2 > HOLDS_CHI2 else UNCHANGED)(**sizes)
+        return (DOUBTFUL if self.change.chi2 > SURPRISING_CHI2 else UNCHANGED)(**sizes)
 
     @property
     def _is_located(self) -> bool:

@@ -10,7 +10,14 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes
+from lce_rig.core.geometry import (
+    SIGMA_PER_MAD,
+    Array,
+    invert,
+    largest_sizes,
+    rotation_angle,
+    sigma_sizes,
+)
 from lce_rig.core.results import BoardSurface, LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action
@@ -392,7 +399,7 @@ def distance_findings(
         return []
     ratios = np.log(camera_m[is_far] / lidar_m[is_far])
     ratio = float(np.median(ratios))
-    sigma = 1.4826 * float(np.median(np.abs(ratios - ratio))) / np.sqrt(len(in_camera))
+    sigma = SIGMA_PER_MAD * float(np.median(np.abs(ratios - ratio))) / np.sqrt(len(in_camera))
     if abs(ratio) < max(0.03, 4 * sigma):
         return []
     scale = float(np.exp(ratio))

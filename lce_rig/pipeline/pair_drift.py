@@ -9,7 +9,7 @@ from lce_rig.core.calibration import Calibration, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import PoseDifference
+from lce_rig.core.geometry import SURPRISING_CHI2, PoseDifference
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
@@ -17,7 +17,6 @@ from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.judge.scene_drift import SceneDrift, watch_scene
 from lce_rig.pipeline.scene_samples import at_image, channel_of, moving, picture_of
 from lce_rig.rig import Rig
-from lce_rig.scene.estimate import HOLDS_CHI2
 from lce_rig.scene.findings import (
     CLOCKS_APART,
     CLOCKS_INSTEAD,
@@ -87,7 +86,7 @@ class PairDrift:
             return []
         scene, board = self.drift.change, self.board
         apart = PoseDifference(scene.tangent - board.tangent, scene.cov + board.cov)
-        return [CONTRADICTION(**apart.sizes)] if apart.chi2 > HOLDS_CHI2 else []
+        return [CONTRADICTION(**apart.sizes)] if apart.chi2 > SURPRISING_CHI2 else []
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 
-SIGMAS_RAD = (0.024, 0.012, 0.006, 0.003)
+SIGMAS_RAD = tuple(0.024 / 2**level for level in range(4))
 """Blur of the fields: 1.4 deg, the error of rough extrinsics, down to the width of an outline."""
 
 _WORKING_FOCAL_PX = 1000.0  # Focal length above which images are halved first, px.

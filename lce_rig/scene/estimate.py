@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.geometry import SURPRISING_CHI2, Array, difference, perturb
 from lce_rig.lens.models import grid_rays, model_of
 from lce_rig.scene.edge_pyramid import SIGMAS_RAD
 from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
@@ -17,10 +17,10 @@ EstimateState = Literal["usable", "few_edges", "beyond_reach", "ambiguous", "wea
 """Usable, or the reason why not: too few edges; a maximum at the border of the region searched; another
 maximum of nearly the same score; a score no higher than of images and scans that do not belong together."""
 
-REACH = np.array([0.2, 0.2, 0.2, *np.radians([2.0, 2.0, 2.0])])
+REACH = np.repeat([0.2, np.radians(2.0)], 3)
 """Region searched about the start by default, m and rad."""
 
-_UNITS = np.array([0.05, 0.05, 0.05, *np.radians([0.5, 0.5, 0.5])])  # Steps of like effect, for the search.
+_UNITS = REACH / 4  # Steps of like effect, for the search.
 # Random starts at each width of the fields, coarse to fine, and maxima kept from it.
 _N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
 _SEARCH_EDGES = 3000  # on all but the finest fields
@@ -30,7 +30,7 @@ _BEYOND = 1.5  # Largest distance from the start, in reaches
 
 # Chosen on KITTI's views, simulated rooms and streets, and boards of os1_64, acfr_vlp16, rlfs01 and rlfs02.
 _INFLATION = 2.0  # of standard deviations: neighbouring blocks share surfaces
-_BIAS = np.array([0.02, 0.02, 0.02, *np.radians([0.03, 0.03, 0.06])])
+_BIAS = np.array([*[0.02] * 3, *np.radians([0.03, 0.03, 0.06])])
 """Standard deviation of errors that all edges of a scene share: beam width, lens, time. m, rad."""
 _LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
 
@@ -38,14 +38,13 @@ _MIN_EDGES = 60
 MIN_SCORE = 0.10  # Unrelated images and scans reach 0.06.
 MIN_GAIN = 2.0  # Significance over other extrinsics
 _NEAR_SIGMAS = 2.0  # Displacement of extrinsics within their errors, along each axis
-HOLDS_CHI2 = 16.81
-"""Largest chi-squared, of six degrees of freedom, of poses that count as one: 99 %."""
-# Non-centrality of a chi-squared of six degrees of freedom that exceeds HOLDS_CHI2 in 95 % of cases.
+# Non-centrality of a chi-squared of six degrees of freedom that exceeds SURPRISING_CHI2 in 95 % of cases.
 _NOTICED = 27.04
 _CONTROL_SIGMAS = 3.0  # Displacement after which extrinsics must score less.
 _UNDETERMINED = 0.5  # Standard deviation of an undetermined direction, in reaches.
 _LENS_STEP_RAD = 1e-3  # Displacement in the image, by focal length, of a difference by the intrinsics
-_FOCAL_STEPS = (-0.02, -0.01, 0.01, 0.02)  # Relative changes of the focal lengths that are compared.
+# Relative changes of the focal lengths that are compared.
+_FOCAL_STEPS = tuple(0.01 * step for step in (-2, -1, 1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +214,8 @@ def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
 
 def _gain(score: OutlineScore, best: Array, others: Sequence[Array], cov: Array) -> float:
     """Compute the minimum significance, by blocks, of the maximum over others outside its covariance."""
-    others = [other for other in others if (other - best) @ np.linalg.solve(cov, other - best) > HOLDS_CHI2]
+    chi2 = [(other - best) @ np.linalg.solve(cov, other - best) for other in others]
+    others = [other for other, each in zip(others, chi2, strict=True) if each > SURPRISING_CHI2]
     return min((significance(score, best, score, other) for other in others), default=np.inf)
 
 

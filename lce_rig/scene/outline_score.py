@@ -13,11 +13,8 @@ from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid, build_event_pyramid, places
 from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outlines
 
-_BESIDE_RAD = 0.06  # Margin of the image in which outlines are kept: other extrinsics bring them in.
+_BESIDE_RAD = 0.06  # As far as the score is searched: outlines so near the image, or events, are used.
 _NEAREST_M = 0.5  # in front of the camera
-_EVENTS_NEAR_RAD = (
-    0.06  # Edges without events nearer than this are not used: as far as the score is searched.
-)
 _MAX_EDGES = 4000  # of one view; more add time and, of one view, hardly any information
 _COLUMNS, _ROWS = 8, 3  # Blocks of the image
 
@@ -61,7 +58,7 @@ def build_outline_view(
     pyramid = build_event_pyramid(image, intrinsics.fx_px)
     # Edges without events about them stand still before a standing rig: they say nothing.
     pixels, _ = intrinsics.project(transform(T_cam_lidar, outlines.points))
-    has_events = pyramid.has_edges_near(pixels, _EVENTS_NEAR_RAD * intrinsics.fx_px)
+    has_events = pyramid.has_edges_near(pixels, _BESIDE_RAD * intrinsics.fx_px)
     return OutlineView(capture, outlines.select(has_events), pyramid)
 
 

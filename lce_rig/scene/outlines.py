@@ -19,11 +19,11 @@ UPRIGHT, LEVEL, REFLECTIVITY = range(len(KINDS_OF_EDGES))
 
 _N_NEIGHBOURS = 24  # returns: two rings on either side of an HDL-64E, and five azimuth steps
 _NEAR_RAD = 0.016  # Largest angle to a neighbour: twice the gap between the lower rings of an HDL-64E.
-_JUMP_M = 0.3  # Smallest jump of range at an outline: above the relief of one surface, twice `_JOINT_M`.
+_JOINT_M, _JOINT_SHARE = 0.15, 0.02  # Largest step on one surface: m, and share of the range.
+_JUMP_M = 2 * _JOINT_M  # Smallest jump of range at an outline: above the relief of one surface.
 # Smallest ratio of a jump to the step on the near surface, which a slanted wall has as well.
 _JUMP_STEPS = 3.0
-_FULL_JUMP_M = 3.0  # Jump above which the weight no longer grows.
-_JOINT_M, _JOINT_SHARE = 0.15, 0.02  # Largest step on one surface: m, and share of the range.
+_FULL_JUMP_M = 10 * _JUMP_M  # Jump above which the weight no longer grows.
 
 _BRIGHT_PERCENTILE = 95  # Reflectivity taken as 1; road signs are far brighter.
 _FAINT = 0.05  # Reflectivity, and change of it, at the level of noise.

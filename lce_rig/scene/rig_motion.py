@@ -11,20 +11,22 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, exp_so3, log_so3
 from lce_rig.core.interrupts import without_interrupt
 from lce_rig.scene.edge_pyramid import SIGMAS_RAD
+from lce_rig.scene.estimate import MIN_GAIN
 from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 
 # Motion limits of a standing rig over 0.1 s, beyond noise and people passing by.
 _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
 _LONGEST_GAP_S = 0.5
 _VOXEL_M = 0.15
-_REACH_M = 0.6  # of the first round of matching
+_REACH_M = 4 * _VOXEL_M  # of the first round of matching
 _ROBUST_M = 0.1  # Residuals above this have little weight: people and cars move differently.
 _MIN_FITNESS = 0.5
 _NORMALS_M = 0.8
-_CLOCKS_S = np.linspace(-0.15, 0.15, 31)
+_LATEST_S = 0.15  # of images after their timestamps, or before
+_CLOCKS_S = np.linspace(-_LATEST_S, _LATEST_S, 31)
 # Smallest time offset not explained by slightly varying motion, s.
 _APART_S = 0.02
-_APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
+_APART_SIGMAS = 3.0
 # Fraction of the score below which clocks explain images less well than changed extrinsics.
 _NEARLY = 0.1
 
@@ -159,7 +161,7 @@ def clocks_apart_s(
     gains = by_block[total.argmax()] - by_block[len(_CLOCKS_S) // 2]
     significance = gains.sum() / max(np.linalg.norm(gains), 1e-12)
     is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * sigma_s)
-    return peak_s if is_apart and significance > _APART_SIGNIFICANCE else None
+    return peak_s if is_apart and significance > MIN_GAIN else None
 
 
 def _peaks(columns: Array) -> Array:

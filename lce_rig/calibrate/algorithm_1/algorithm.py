@@ -31,7 +31,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Certificate, Diagnostics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import SIGMA_PER_MAD, Array, pose
 from lce_rig.core.results import Observation
 
 NOMINAL_SIGMA_M = 0.01
@@ -248,5 +248,5 @@ def reject_outliers(
 def _excess(errors: Array) -> Array:
     """Divide errors (F,) by the largest error attributed to noise."""
     median = float(np.median(errors))
-    deviation = 1.4826 * float(np.median(np.abs(errors - median)))
+    deviation = SIGMA_PER_MAD * float(np.median(np.abs(errors - median)))
     return errors / max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)

@@ -22,13 +22,14 @@ from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetri
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
-BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
+BACKGROUND_SIGMAS_M = (EDGE_SHIFT_SIGMA_M, 0.01, EDGE_SHIFT_SIGMA_M)
 """Prior standard deviations of the shifts, in the order of `describe_background`."""
 # Prior standard deviations of the extrinsics around which the shifts are estimated.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
-# Noise of a ring end, and the number of sigmas beyond which its weight decreases.
-_END_SIGMA_M, _HUBER = 0.003, 1.5
+_END_SIGMA_M = 0.003  # noise of a ring end
+HUBER = 1.5
+"""Number of standard deviations beyond which a weight decreases (95 % efficient)."""
 _ROUNDS = 5
 # Groups of columns tested for significance: all, far background, near background.
 _TOGETHER = ((0, 1, 2), (0,), (1, 2))
@@ -92,7 +93,7 @@ def _fit_shifts(
     A = A * np.concatenate([np.ones(7), free])
     prior, x = np.diag(np.square(_END_SIGMA_M / sigmas)), np.zeros(len(sigmas))
     for _ in range(_ROUNDS):
-        weights = 1 / np.maximum(np.abs(inside_m - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
+        weights = 1 / np.maximum(np.abs(inside_m - A @ x) / (HUBER * _END_SIGMA_M), 1.0)
         information = A.T @ (weights[:, None] * A) + prior
         x = np.linalg.solve(information, A.T @ (weights * inside_m))
     gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)

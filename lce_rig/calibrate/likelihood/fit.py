@@ -14,9 +14,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.algorithm_1.background import HUBER
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import EXACT, LOG_SIGMA, MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, no_scans, stack_scans
 from lce_rig.calibrate.observations import group_poses
@@ -29,7 +30,7 @@ from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoar
 # Maximum number of steps between two fits of the levels, and after the last one.
 STEPS, _LAST_STEPS = 3, 20
 # Step lengths below which these end, in standard deviations of all unknowns together.
-NEAR, _SETTLED = 0.1, 5e-3
+NEAR, SETTLED = 0.1, 5e-3
 # Rounds of the search for noise levels, each followed by a new linearisation.
 _LEVEL_ROUNDS = (8, 4, 8)
 # First blurs of ring ends, rad. Until the edge shift is known, all ends may lie outside their intervals,
@@ -37,8 +38,8 @@ _LEVEL_ROUNDS = (8, 4, 8)
 BLURS_RAD = (4e-3, 1.5e-3)
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
-# Huber's constant, in standard deviations of a placement's influence (95 % efficient), and an upper bound.
-_HUBER, _FARTHEST = 1.5, 1e6
+# Largest influence of a placement, in standard deviations: its weight stays above 0.
+_FARTHEST = 1e6
 # Number of plain steps before Anderson mixing, and of steps that it combines.
 _PLAIN, _MIXED = 3, 5
 # Errors of lens and board that `Priors.held` fixes.
@@ -266,14 +267,14 @@ def _maximise(
     Captures are weighted by their disagreement on the extrinsics; those of one placement (F,) share a weight.
     """
     held = priors.held
-    now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
+    now = usual = replace(usual, laser_m=max(usual.laser_m, EXACT))
     terms = approach(terms, now, held)
     for n_rounds in _LEVEL_ROUNDS:
         terms = settle(terms, now, held, STEPS, NEAR)
         now = fit_levels(terms, now, usual, held, n_rounds)
         if terms.images:
             terms = replace(terms, trust=trust_captures(terms, now, held, placement))
-    return JointEstimate(settle(terms, now, held, _LAST_STEPS, _SETTLED), now, priors, placement, captures)
+    return JointEstimate(settle(terms, now, held, _LAST_STEPS, SETTLED), now, priors, placement, captures)
 
 
 def approach(terms: Terms, levels: Levels, priors: Priors) -> Terms:
@@ -369,7 +370,7 @@ def fit_levels(
     """
     from scipy.optimize import minimize
 
-    names = [name for name in names if name != "laser_m" or usual.laser_m > NO_LASER_M]
+    names = [name for name in names if name != "laser_m" or usual.laser_m > EXACT]
     sigma = np.array([LOG_SIGMA[name] for name in names])
     middle = np.log([getattr(usual, name) for name in names])
     # Thousands of ranges but few captures determine a level: without scaling, the search zigzags.
@@ -451,7 +452,7 @@ def by_influence(cost: Quadratics, J: Array) -> Array:
     squares = np.einsum("gi,ij,gj->g", moves, precision, moves)
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
-    return np.asarray((_HUBER / np.clip(z, _HUBER, _FARTHEST))[cost.placement])
+    return np.asarray((HUBER / np.clip(z, HUBER, _FARTHEST))[cost.placement])
 
 
 def weigh_placements(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:

@@ -34,7 +34,7 @@ from lce_rig.core.results import Observation
 # the length that ends these, in standard deviations.
 _OWN_STEPS, _STEPS, _SHORT = 4, 80, 0.5
 _LEVEL_ROUNDS = 8
-_TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((4, 3)))
+_TURNS = pose(exp_so3(np.radians([0, 90, 180, 270])[:, None] * np.eye(3)[2]), np.zeros((4, 3)))
 
 
 @dataclass(frozen=True, eq=False)

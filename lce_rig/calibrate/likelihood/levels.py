@@ -1,7 +1,7 @@
 """Noise levels in the likelihood, and their priors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -67,16 +67,8 @@ class Levels:
 
 
 LOG_SIGMA: Mapping[str, float] = {
-    "range_m": 0.7,
-    "ring_m": 0.7,
-    "edge_rad": 0.7,
-    "backed_rad": 1.0,
-    "lost_share": 1.0,
-    "own_shift_m": 1.0,
-    "tilt_rad": 0.7,
-    "spin_rad": 0.7,
-    "depth_m": 0.7,
-    "across_m": 0.7,
+    **{level.name: 0.7 for level in fields(Levels)},
+    **dict.fromkeys(("backed_rad", "lost_share", "own_shift_m"), 1.0),
     "laser_m": 0.3,
 }
 """Prior standard deviation of the logarithm of each level; the profile gives the lasers' spread."""
@@ -86,8 +78,8 @@ OF_IMAGES = ("tilt_rad", "spin_rad", "depth_m", "across_m")
 """The levels of a board's pose in an image."""
 
 
-# Standard deviations of exact constants, m and relative.
-_EXACT_M, _EXACT = 1e-6, 1e-6
+EXACT = 1e-6
+"""Standard deviation of an exact constant, m, rad or relative: far below any that data determine."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +123,8 @@ class Priors:
     bow_m: float = 0.001
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
-    stretch: float = 1e-6
-    contrast_m: float = 1e-6
+    stretch: float = EXACT
+    contrast_m: float = EXACT
     beam: float = 1.0
     known: KnownLidar | None = None
     squares: float = 0.001
@@ -155,7 +147,7 @@ class Priors:
     @property
     def held(self) -> "Priors":
         """Fix the pattern's position and the lenses."""
-        return replace(self, pattern_m=_EXACT_M, optics=_EXACT)
+        return replace(self, pattern_m=EXACT, optics=EXACT)
 
     @property
     def of_print(self) -> dict[str, Array]:
@@ -163,24 +155,20 @@ class Priors:
         return {"squares": np.array([self.squares]), "pattern": np.array([self.pattern_m, self.pattern_m])}
 
 
-# Spread of lasers' offsets if the profile has none, m.
-NO_LASER_M = 1e-6
-
-
 def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read the priors of constant errors and noise from the options."""
-    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    offset_m = max(options.range_offset_sigma_m, EXACT)
     priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     if not options.has_rings:
         # Without an axis there is no lens beside it.
-        priors = replace(priors, lateral_m=_EXACT_M, vertical_m=_EXACT_M)
+        priors = replace(priors, lateral_m=EXACT, vertical_m=EXACT)
     if options.tolerances is not None:
         known = options.tolerances
         priors = replace(
             priors,
-            squares=max(known.square_size, _EXACT),
-            pattern_m=max(known.pattern_offset_m, _EXACT_M),
-            plate_m=max(known.plate_m, _EXACT_M),
-            bow_m=max(known.bow_m, _EXACT_M),
+            squares=max(known.square_size, EXACT),
+            pattern_m=max(known.pattern_offset_m, EXACT),
+            plate_m=max(known.plate_m, EXACT),
+            bow_m=max(known.bow_m, EXACT),
         )
     return priors, Levels(laser_m=options.laser_bias_sigma_m)

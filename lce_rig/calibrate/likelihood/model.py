@@ -14,7 +14,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.end_density import edge_products
 from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
 from lce_rig.calibrate.likelihood.layout import BOARD, END, LASER, OWN, RING, Columns, Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import EXACT, OF_IMAGES, Levels, Priors
 from lce_rig.calibrate.likelihood.rays import (
     EdgeRows,
     RangeSums,
@@ -29,11 +29,6 @@ from lce_rig.core.geometry import Array
 
 # Step of a level's logarithm for numerical differences.
 _LOG_STEP = 1e-4
-# The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
-# extrinsics. This much of it is left.
-_MEAN_FLOOR = 1e-6
-# Standard deviation of the pose of a camera that is the base, m and rad: practically fixed.
-_BASE_SIGMA = 1e-6
 _OF_PROFILE = frozenset(BOARD)
 
 
@@ -388,7 +383,7 @@ def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
         prior[at, at] = sigma**-2.0
     if layout.base is not None:
         at = layout.camera(layout.base)
-        prior[at, at] = _BASE_SIGMA**-2.0
+        prior[at, at] = EXACT**-2.0
     for at in (layout.z.of(sigmas.keys() & _OF_PROFILE), layout.plate):
         # Weights of Student's distribution at the present values.
         prior[at, at] /= 1 + prior[at, at] * terms.state.z[at] ** 2 / priors.freedoms
@@ -399,7 +394,9 @@ def prior_of(terms: Terms, levels: Levels, priors: Priors) -> Known:
             cov = each**2 * np.eye(L)
             cov[measured, measured] = known.lasers_sigma[k, which] ** 2
             mean[at[measured]] = known.lasers[k, which]
-        cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
+        # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part
+        # of the extrinsics.
+        cov = cov + common**2 + EXACT**2 * np.eye(L)
         prior[at[:, None], at] = np.linalg.inv(cov)
         log_volume += float(np.linalg.slogdet(cov)[1])
     return Known(prior, terms.state.z - mean, log_volume)

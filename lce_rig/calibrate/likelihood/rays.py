@@ -63,6 +63,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.layout import END, FIELDS, RING, Indices, State
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
@@ -76,8 +77,6 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.pattern import is_dark
 from lce_rig.core.results import LidarBoard
 
-# Typical noise of a cell's mean without rings.
-_MEAN_M = 0.008
 # Half a beam's width, and the error of the outline found in the scan.
 _BORDER_M = 0.02
 # Shortest step, m: on an edge parallel to its ring, a ring end has almost no step and determines the edge
@@ -173,7 +172,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         rays=points / range_m[:, None],
         range_m=range_m,
         fields=displacements(points, T_lidar_board[capture], board),
-        weight=np.array([1.0 if lidar.has_rings else _MEAN_M / lidar.sigma_m for lidar in boards]),
+        weight=np.array([1.0 if lidar.has_rings else Levels().range_m / lidar.sigma_m for lidar in boards]),
         end_capture=end_capture[sorted_ends],
         end_ring=end_ring[sorted_ends],
         end_rays=end_rays,

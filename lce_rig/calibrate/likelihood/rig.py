@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.likelihood.fit import (
     BLURS_RAD,
     NEAR,
+    SETTLED,
     STEPS,
     Optimum,
     by_influence,
@@ -46,8 +47,8 @@ from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, relative_pose, skew
 
-# Maximum number of steps, and step length below which they end, in standard deviations.
-_STEPS, _SETTLED = 20, 5e-3
+# Maximum number of steps.
+_STEPS = 20
 _POSE = OWN["pose"].stop
 # Standard deviation of a LiDAR's lens, lateral and vertical, m, from errors of the ring ends' model that all
 # boards share: measured in simulated sessions of an OS1-64. The scatter does not contain them.
@@ -294,4 +295,4 @@ def maximise_rig(
         + [estimate.lidar(m)[1] for m in range(1, len(scans))]
     )
     trust = once * by_influence(estimate.cost, J)
-    return replace(estimate, terms=settle(terms.weighted(trust), 0.0, _STEPS, _SETTLED))
+    return replace(estimate, terms=settle(terms.weighted(trust), 0.0, _STEPS, SETTLED))

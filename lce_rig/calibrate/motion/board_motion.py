@@ -26,7 +26,7 @@ _USUAL_WEIGHT = 3.0
 _N_LEARNING = 15
 # Errors of board poses not covered by corner noise: lens, board and reconstruction.
 POSE_FLOOR = np.r_[np.full(3, 1e-3), np.full(3, np.radians(0.1))]
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+_HALF_TURN = np.diag([-1, -1, 1])
 
 
 @dataclass(frozen=True, eq=False)

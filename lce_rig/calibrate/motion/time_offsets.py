@@ -44,10 +44,11 @@ _MOVED = 1.0
 # Prior standard deviations of time offsets, s: for a profile without a tolerance, and for images without
 # timestamps, which may have been taken at any time around the scan.
 _TOLERANCE_S, _NO_STAMPS_SIGMA_S = 0.05, 0.15
+# Offsets searched, and step of the grid, s; step of numerical differences.
 _REACH_S, _GRID_S = 0.2, 0.04
-_STEP_S = 0.004
+_STEP_S = _GRID_S / 10
 _N_ITERATIONS = 6
-_CONVERGED_S = 5e-4
+_CONVERGED_S = _STEP_S / 8
 # Squared term of a capture at which its weight is halved; it has three to six degrees of freedom.
 _ROBUST = 12.0
 _FREEDOMS = 3

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors, what_is_known
+from lce_rig.calibrate.likelihood.levels import EXACT, Levels, Priors, what_is_known
 from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, KnownLidar, Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -74,7 +74,7 @@ class SensorModel:
             target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
             target_sigma_m=rig.calibration.target_sigma_m,
             priors=priors,
-            levels=replace(levels, range_m=sheet.range_sigma_m, laser_m=max(levels.laser_m, NO_LASER_M)),
+            levels=replace(levels, range_m=sheet.range_sigma_m, laser_m=max(levels.laser_m, EXACT)),
             pattern=sheet.pattern,
             width_rad=float(np.radians(sheet.fov_deg[0])),
         )

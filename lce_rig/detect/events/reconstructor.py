@@ -95,7 +95,8 @@ class ReconstructionModel:
 _PERCENTILES = (1.0, 99.0)
 # Smallest spread that is stretched to the full range: below it is noise, not contrast.
 _MIN_SPREAD = 0.05
-_SCALE_MEMORY = 0.8
+# Share of the earlier images in the running means of scale and active pixels.
+_MEMORY = 0.8
 
 
 class IntensityScale:
@@ -108,7 +109,7 @@ class IntensityScale:
         """Update the scale with the stream's next image, (H, W)."""
         bounds = _bounds(picture)
         if self._smooth is not None:
-            bounds = _SCALE_MEMORY * self._smooth + (1 - _SCALE_MEMORY) * bounds
+            bounds = _MEMORY * self._smooth + (1 - _MEMORY) * bounds
         self._smooth = bounds
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
@@ -133,7 +134,6 @@ _MIN_FILL = 0.5
 _LONGEST_SILENCE_NS = 2_000_000_000
 # Largest time from a stream's last event to a requested timestamp at its end, ns.
 _MAX_AFTER_END_NS = 100_000_000
-_SHARE_MEMORY = 0.8
 # Number of steps until the states have settled, on a real DAVIS346 recording.
 N_WARM_UP = 12
 
@@ -293,7 +293,7 @@ class Reconstructor:
         events = self._noise.clean(events)
         picture, states = self._picture(events, window.start_ns, end_ns, window.states)
         self._scale.follow(picture)
-        memory = _SHARE_MEMORY if self.n_steps else 0.0
+        memory = _MEMORY if self.n_steps else 0.0
         self._share = memory * self._share + (1 - memory) * active_share(events)
         self._previous = replace(window, events=events)
         last_ns = int(window.events.t_ns[-1]) + 1 if len(window.events) else end_ns

@@ -13,7 +13,7 @@ _EVENTS_PER_PIXEL = 0.35
 BLOCK_PX = 16
 # Fraction of active pixel blocks in a typical scene with a moving camera; see `active_share`.
 _USUAL_ACTIVE_SHARE = 0.25
-_MIN_ACTIVE_SHARE = 0.05
+_MIN_ACTIVE_SHARE = _USUAL_ACTIVE_SHARE / 5
 _LONGEST_NS = 60_000_000
 _SHORTEST_NS = 20_000_000
 

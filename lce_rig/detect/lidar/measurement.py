@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import SIGMA_PER_MAD, Array
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
 from lce_rig.detect.lidar.template import (
@@ -23,7 +23,6 @@ from lce_rig.detect.lidar.template import (
 
 # Ring ends on a board, whether they are the board's border, and the size they imply.
 
-_MAD = 1.4826  # standard deviation of normal noise over its median magnitude
 _QUARTILE = 1.1503  # third quartile of |x| of a normal distribution, in its standard deviations
 _MIN_SMEARED = 8  # minimum number of ring ends to measure a smear: a fit takes five freedoms
 _CROSSING = 0.3  # minimum share of its gaps by which a ring crosses a side, for ends that show a smear
@@ -139,7 +138,7 @@ def measure_size(
     x = np.zeros(5)
     for _ in range(6):
         residual = target - jacobian @ x
-        scale = max(median(np.abs(residual[usable])) * _MAD, 0.003) if usable.any() else 0.01
+        scale = max(median(np.abs(residual[usable])) * SIGMA_PER_MAD, 0.003) if usable.any() else 0.01
         weight = usable * np.maximum(1 - (residual / (4.7 * np.maximum(scale, sigma_m))) ** 2, 0.0) ** 2
         information = (jacobian * (weight / sigma_m**2)[:, None]).T @ jacobian + prior
         x = np.linalg.solve(information, jacobian.T @ (weight / sigma_m**2 * target))
@@ -239,7 +238,7 @@ def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple
         (4,) plane as (n, d), n towards the LiDAR, and a robust standard deviation of the returns from it, m.
     """
     height_m = points @ start[:3] + start[3]
-    scale_m = _MAD * median(np.abs(height_m - median(height_m))) + 0.001
+    scale_m = SIGMA_PER_MAD * median(np.abs(height_m - median(height_m))) + 0.001
     scale_m = scale_m * distance_m / start[3]
     range_m = np.linalg.norm(points, axis=1)
     rays = points / range_m[:, None]
@@ -252,7 +251,7 @@ def fit_plane_to_ranges(points: Array, start: Array, distance_m: float) -> tuple
         hessian = (jacobian * weight[:, None]).T @ jacobian
         m = m + np.linalg.solve(hessian + 1e-9 * np.eye(3), jacobian.T @ (weight * residual))
     plane = np.append(-m, 1.0) / np.linalg.norm(m)
-    return plane, _MAD * median(np.abs(points @ plane[:3] + plane[3]))
+    return plane, SIGMA_PER_MAD * median(np.abs(points @ plane[:3] + plane[3]))
 
 
 def refine(

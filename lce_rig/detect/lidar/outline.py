@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.measurement import SLACK_M
 from lce_rig.detect.lidar.segments import Indices
-from lce_rig.detect.lidar.template import Placement
+from lce_rig.detect.lidar.template import CAP_M, Placement
 
 N_ANGLES = 9
 # Fraction of rays on the wrong side of any border; with 0, a single ray would decide.
 _OUTLIERS = 0.02
-# Distance from the border beyond which rays do not locate it, m.
-_BAND_M = 0.10
 # Blurs of the first rounds, m, which converge from an inaccurate start; wider ones for a rough start.
-_ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
+_ANNEALED_M = (0.04, 0.02)
+_WIDE_M = tuple(np.geomspace(0.2, _ANNEALED_M[0], 8).tolist())
 _FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
 # Maximum fraction of rays that contradict the placement of a clear plate.
@@ -35,8 +35,8 @@ _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
-_SMEARS_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06])
-_OFFSETS_M, _LEAST_SIGMA_M = np.linspace(-0.05, 0.05, 41), 0.001
+_SMEARS_M = np.append(0.0, np.geomspace(0.005, 0.06, 7))
+_OFFSETS_M = np.linspace(-SLACK_M, SLACK_M, 41)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def fit_outline(
     Returns:
         The optimum, None if no ray is near the border.
     """
-    rays = rays.select(np.abs(start.distance_m(rays.uv)) < _BAND_M + 3 * max(annealed_m))
+    rays = rays.select(np.abs(start.distance_m(rays.uv)) < CAP_M + 3 * max(annealed_m))
     rays = rays.select(thin(len(rays.uv), _MOST_RAYS))
     expected = np.array([0.0, 0.0, 0.0, *growth_m[0]])
     x = expected + [start.u_m, start.v_m, start.angle_rad, 0.0, 0.0]
@@ -109,7 +109,7 @@ def fit_outline(
         least = annealed_m[k] if k < len(annealed_m) else 0.0
         placement = Placement(x[0], x[1], x[2], (half[0] + x[3], half[1] + x[4]))
         local = placement.local(rays.uv)
-        near = np.abs(placement.beyond_m(local)) < max(_BAND_M, 3 * least)
+        near = np.abs(placement.beyond_m(local)) < max(CAP_M, 3 * least)
         if np.count_nonzero(near & rays.is_on) < 10:
             return None
         local = local[near]
@@ -200,7 +200,7 @@ def measure_smears(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         (4,) smear of the right, left, top and bottom side.
     """
     placement = outline.placement
-    near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
+    near = rays.select(np.abs(placement.distance_m(rays.uv)) < CAP_M)
     near = near.select(thin(len(near.uv), _SMEAR_RAYS))
     local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
     beam_m = blur_m(placement.axes)[[0, 0, 1, 1]]
@@ -271,7 +271,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
         for side, sign in ((2 * axis, 1.0), (2 * axis + 1, -1.0)):
             blur = float(np.hypot(blur_m(axes[axis][None])[0], smears_m[side]))
             beyond = sign * local[:, axis] - half[axis]
-            use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
+            use = (np.abs(beyond) < CAP_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
             # Without rays near the border, it may lie anywhere between the rays on its two sides.
             p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr((_OFFSETS_M[:, None] - s) / blur)
@@ -280,7 +280,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             weight = np.exp(total - total.max(axis=0))
             weight /= weight.sum(axis=0)
             off = _OFFSETS_M @ weight
-            sigma_m = np.sqrt(np.maximum(_OFFSETS_M**2 @ weight - off**2, _LEAST_SIGMA_M**2))
+            sigma_m = np.sqrt(np.maximum(_OFFSETS_M**2 @ weight - off**2, 0.0))
             n_on = np.bincount(strip[is_on], minlength=n_strips)
             n_beside = np.bincount(strip[~is_on], minlength=n_strips)
             is_seen = (n_on >= 4) & (n_beside >= 4)

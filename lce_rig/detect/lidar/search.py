@@ -145,10 +145,8 @@ def other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
 
 
 MAX_CANDIDATES = 4
-# Limits of a clear plate: minimum rings, maximum fraction of other returns in its plane.
-CLEAR_RINGS = 6
-CLEAR_SHARE = 0.05
-# Fraction of returns beyond the outline above which, beside a clear board, a plate is part of a wall.
+# Fraction of returns beyond the outline above which, beside a board that nothing touches, a plate is part of
+# a wall.
 PATCH_SHARE = 0.20
 # Incidence above which dark squares may return nothing, and minimum fraction of beams lost there.
 GRAZING_RAD = np.radians(35.0)
@@ -194,7 +192,7 @@ def find_lidar_boards(
                 misses.append(measured)
             elif measured is not None:
                 boards.append(measured)
-                if measured.quality.n_rings >= CLEAR_RINGS and measured.quality.beyond_share < CLEAR_SHARE:
+                if measured.quality.beyond_share < TOUCHING_SHARE:
                     max_beyond = PATCH_SHARE
         if boards:
             break

@@ -18,7 +18,7 @@ from lce_rig.detect.findings import (
     LIDAR_TOO_FEW_POINTS,
     LIDAR_TURNED,
 )
-from lce_rig.detect.lidar.measurement import Beam, fit_plane_to_ranges, median
+from lce_rig.detect.lidar.measurement import EDGE_TOLERANCE_M, Beam, fit_plane_to_ranges, median
 from lce_rig.detect.lidar.outline import (
     STRIP_M,
     Outline,
@@ -32,6 +32,8 @@ from lce_rig.detect.lidar.outline import (
 )
 from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
+    LAYER_M,
+    MARGIN_M,
     STANDARD,
     Limits,
     board_at,
@@ -54,24 +56,22 @@ _MOST_PATCHES = 8
 _ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
-_NOISE_M = 0.012  # maximum noise of a plane's returns, assumed until the cloud's own is measured
-_SURROUND_M = 0.25
 _MIN_POINTS = 60
 # Approximate error of the directions of a rosette's beams, rad.
 _DIRECTION_RAD = 7e-4
 # Fraction of the plate without returns above which it reaches out of the field of view.
 _DARK_SHARE = 0.08
-_BEHIND_M, _FOOT_M = 0.05, 0.15
+_FOOT_M = 0.15
 # Range differences of black and white squares, and of glare, reach centimetres at perpendicular incidence.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
-# Limits of another plate: fraction of rays that contradict the best placement, and growth of the outline.
-_MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
+# Growth of the outline above which it is that of another plate.
+_MOST_GROWTH_M = 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
 # Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
-_STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
+_STRIP_OFF = 4.0
 # Maximum blur of a still board's border, m (at most 5 mm on recordings); a wider border is weighted by its
 # width.
 _MOST_SMEAR_M = 0.008
@@ -139,7 +139,7 @@ def look_for_unstructured_board(
 
 def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[np.bool_]:
     """Find the rays (N,) that pass the board's centre closely enough to locate its border."""
-    reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + _SURROUND_M
+    reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + MARGIN_M
     squared_cosine = 1.0 / (1.0 + (reach_m / np.linalg.norm(centre)) ** 2)
     along = points @ (centre / np.linalg.norm(centre)).astype(points.dtype)
     squared_m2 = np.einsum("ij,ij->i", points, points)
@@ -167,7 +167,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     plane, _, eigenvalues = fit_planes(around)
     normal = plane[:, :3]
     flat = (around[:, 0] >= _MIN_CELL_POINTS) & (eigenvalues[:, 1] > (0.35 * cell_m) ** 2)
-    flat &= eigenvalues[:, 0] < (2.0 * _NOISE_M) ** 2
+    flat &= eigenvalues[:, 0] < (2.0 * STANDARD.rms_m) ** 2
     if not flat.any():
         return Plates.none()
     i, j = pairs.take(np.flatnonzero(flat[pairs].all(axis=1)), axis=0).T
@@ -175,7 +175,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     apart = centres.take(j, axis=0) - centres.take(i, axis=0)
     joined = np.abs(np.einsum("ij,ij->i", of_i, of_j)) > _SAME_NORMAL
     for side in (of_i, of_j):
-        joined &= np.abs(np.einsum("ij,ij->i", side, apart)) < 2.5 * _NOISE_M
+        joined &= np.abs(np.einsum("ij,ij->i", side, apart)) < 2.5 * STANDARD.rms_m
     graph = coo_array((np.ones(joined.sum()), (i[joined], j[joined])), shape=(n_cells, n_cells))
     n_patches, label = connected_components(graph, directed=False)
     count = np.bincount(label)
@@ -217,6 +217,11 @@ class _View(PlaneView):
 
     returns: Array
     beam: Beam
+
+    @property
+    def is_far_behind(self) -> NDArray[np.bool_]:
+        """Whether rays (M,) return from so far behind the plane that they passed beside the plate."""
+        return self.height_m < -_MOST_TOLERANCE_M
 
     @classmethod
     def of(cls, returns: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
@@ -271,7 +276,7 @@ class _View(PlaneView):
             placement: its rough placement; None if only its middle is known.
         """
         is_on = self.is_on
-        is_beside = self.height_m < -max(self.tolerance_m, _BEHIND_M)
+        is_beside = self.is_far_behind
         n_on, radius_m = int(np.count_nonzero(is_on)), float(np.hypot(*half_m))
         area = placement or Placement(0.0, 0.0, 0.0, (radius_m, radius_m))
         n_due = n_on * float(np.prod(area.half_m) / np.prod(half_m))
@@ -320,16 +325,11 @@ def measure_unstructured(
     half_m = (board.width_m / 2, board.height_m / 2)
     returns = returns[_rays_about(returns[:, :3], centre, board)]
     returns = returns[thin(len(returns), _MOST_MEASURED)]
-    view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * _NOISE_M, limits)
+    view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * STANDARD.rms_m, limits)
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
         return _too_few(n_on, distance_m)
-    if starts[0].error_m > _MOST_MISSES:
-        size_m = np.percentile(view.uv[view.is_on], 98, axis=0) - np.percentile(
-            view.uv[view.is_on], 2, axis=0
-        )
-        return other_plate(size_m / 0.96, distance_m, board)
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
@@ -365,7 +365,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     # A cell at the rim is dark only if its neighbours are, so the share counts the hidden part of it.
     n_dark = np.count_nonzero(placement.distance_m(dark) < 0)
     dark_share = n_dark * cell_m**2 / (board.width_m * board.height_m)
-    sheet = view.height_m[deep & (np.abs(view.height_m) < 0.06)]
+    sheet = view.height_m[deep & (np.abs(view.height_m) < LAYER_M)]
     rms_m = float(np.sqrt(np.mean(sheet**2))) if len(sheet) else 0.0
     if np.abs(outline.growth_m - view.growth_m(placement)[0]).max() > _MOST_GROWTH_M:
         size_m = np.array([board.width_m, board.height_m]) + 2 * outline.growth_m
@@ -386,7 +386,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         strips = measure_strips(rays, outline, view.blur_m, smears_m)
     # Something touches or hides a strip that deviates from its neighbours.
     strip_smear_m = smears_m[strips.side]
-    is_good = (strips.sigma_m < np.hypot(_STRIP_SIGMA_M, strip_smear_m)) & (
+    is_good = (strips.sigma_m < np.hypot(EDGE_TOLERANCE_M, strip_smear_m)) & (
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
     is_touched, behind_m, echo = _look_beyond(view, strips, placement)
@@ -514,9 +514,8 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
         # Rays that pass a plate show its border. An object before the border hides it; the floor, or a stand
         # in its plane, leaves the border's place open.
         is_clear = (view.uv[members] - strips.uv[k]) @ strips.outwards[k] > _CLEAR_M
-        is_there = height_m > -max(view.tolerance_m, _BEHIND_M)
-        is_touched[k] = np.count_nonzero(is_there & is_clear) > _TOUCHED_SHARE * np.count_nonzero(is_clear)
-        is_behind = height_m < -max(view.tolerance_m, _BEHIND_M)
+        is_behind = view.is_far_behind[members]
+        is_touched[k] = np.count_nonzero(~is_behind & is_clear) > _TOUCHED_SHARE * np.count_nonzero(is_clear)
         if np.count_nonzero(is_behind) > _TOUCHED_SHARE * len(members):
             behind_m[k] = -median(height_m[is_behind])
             of_background = median(power[members][is_behind])

@@ -38,7 +38,7 @@ _MOST_COVERED = 0.15
 # Number of scans that determine the range scale of a session's images.
 _SCANS_OF_SCALE = 8
 _GROUND = (38, 34, 32)
-_WINDOW = Intrinsics(640.0, 640.0, 639.5, 359.5, 1280, 720)
+_WINDOW = Intrinsics(640, 640, (1280 - 1) / 2, (720 - 1) / 2, 1280, 720)
 
 
 def draw_overlay(

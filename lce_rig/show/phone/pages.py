@@ -136,7 +136,8 @@ BEAT_S = 1.0
 MAX_MESSAGE_BYTES = 256
 #: Time without an answer after which a page sleeps or is out of range, s; it reconnects when it wakes.
 ANSWER_S = 5.0
-_GOODBYE_S = 0.5
+#: Time for a page to close its connection, s.
+GOODBYE_S = 0.5
 _COOKIE = "lce_rig_preview"
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 # The page loads nothing from elsewhere, and may not be framed.
@@ -230,10 +231,10 @@ class Viewer:
             newest = self._feed.newest()
             if newest is None or newest[0] <= self._delivered:
                 break
-            await asyncio.sleep(_GOODBYE_S / 10)
+            await asyncio.sleep(GOODBYE_S / 10)
         # Closing waits until the page has read all messages; a stuck page never does.
         with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), _GOODBYE_S)
+            await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), GOODBYE_S)
 
     async def _send(self, state: LiveState) -> None:
         jpeg = None
@@ -326,7 +327,7 @@ class Pages:
         return response
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        line = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, timeout=_GOODBYE_S)
+        line = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, timeout=GOODBYE_S)
         await line.prepare(request)
         viewer = Viewer(line, self._feed, self.encoder)
         self._viewers.add(viewer)
