@@ -13,7 +13,7 @@ from lce_rig.core.findings import Finding, Severity
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import summed_covariance
-from lce_rig.judge.explanations import MOUNTINGS, SCATTER, Cause, Selected, explain
+from lce_rig.judge.explanations import CONSTANT, MOUNTINGS, SCATTER, Cause, Selected, explain
 from lce_rig.judge.findings import (
     BOW,
     DRIFTED,
@@ -37,20 +37,21 @@ from lce_rig.judge.findings import (
 from lce_rig.judge.reach import CHANGED_CHI2
 from lce_rig.rig import CalibrationSettings, Rig
 
-# Minimum number of captures to test: the constants alone can absorb fewer.
+# Minimum number of captures to test for changes during the session: extrinsics of two or three captures
+# absorb other errors. Constant errors are tested on any number.
 _FEWEST = 6
 # Limit of the images' noise that counts as explained, in usual levels: one standard deviation of their prior.
 _USUAL = 2.0
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
-    """Give all captures of an estimate full weight, to test explanations; None if there are too few.
+    """Give all captures of an estimate full weight, to test explanations; None without a likelihood.
 
     Args:
         estimate: estimate of any method.
         rejected: captures with the board in both sensors that the estimate does not use.
     """
-    if estimate.joint is None or len(estimate.observations) < _FEWEST:
+    if estimate.joint is None:
         return None
     joint, camera = estimate.joint
     seen = sorted([*estimate.observations.values(), *rejected], key=lambda o: o.capture)
@@ -75,7 +76,8 @@ def find_causes(
         causes: to test; only mountings for two LiDARs, or two cameras.
     """
     found: list[Selected] = []
-    for selected in explain(hypothesis, causes):
+    tested = causes if len(estimate.observations) >= _FEWEST else [c for c in causes if c in CONSTANT]
+    for selected in explain(hypothesis, tested):
         found.append(_in_use(selected, estimate))
         if selected.gain.cause != "alone" and _severity(found[-1].change, target) != "note":
             break
@@ -116,13 +118,15 @@ def report_causes(
         follows = reason.code in PLATES and not OF_SIZES.isdisjoint(each.code for each in others)
         is_resolved = follows or _is_over(cause, estimate.used)
         return [reason, *others], [] if is_resolved else [_displacement(cause, reason)]
-    if selected or estimate.joint is None:
+    if estimate.joint is None:
         return found, []
     levels = estimate.joint[0].levels
-    if levels.of_ranges > max(levels.largest_of_images, SCATTER):
-        return [SCATTERED(lidar, action="ranges", ratio=levels.of_ranges)], []
-    is_noisy = levels.largest_of_images > SCATTER
-    return [SCATTERED(ratio=levels.largest_of_images)] if is_noisy else [], []
+    noise = levels.largest_of_images
+    if selected:
+        noise = min(noise, selected[-1].after.with_fitted_noise.levels.largest_of_images)
+    if levels.of_ranges > max(noise, SCATTER):
+        return [*found, SCATTERED(lidar, action="ranges", ratio=levels.of_ranges)], []
+    return [*found, *([SCATTERED(ratio=noise)] if noise > SCATTER else [])], []
 
 
 def _displacement(cause: Selected, reason: Finding) -> Sensitivity:

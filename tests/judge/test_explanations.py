@@ -10,8 +10,10 @@ from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
 from lce_rig.calibrate.options import Tolerances
 from lce_rig.core.geometry import Array, fit_plane, perturb, tangent_sizes
+from lce_rig.judge.causes import find_causes, hypothesis_of
 from lce_rig.judge.explanations import ALL, Table, explain, log10_chance
 from lce_rig.lens.models import LensPrior
+from lce_rig.rig import CalibrationSettings
 from tests.calibrate.boards import BOARD, CAMERA, Scenario, simulate
 
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.006)
@@ -158,6 +160,23 @@ def test_explain_moved_reports_size_and_capture(angle_deg, first):
 def test_explain_range_offset_reports_size():
     found, *_ = explained(longer(offset_m=0.06)(observed(16, 5)))
     assert found.after.state.lasers[0].mean() == pytest.approx(0.06, abs=0.012)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        slice(0, 5),
+        *(pytest.param(p, marks=pytest.mark.long) for p in (slice(5, 10), slice(10), slice(0, 10, 2))),
+    ],
+    ids=["first", "second", "all", "even"],
+)
+def test_find_causes_long_ranges_in_few_captures_are_named_first(part):
+    observations = longer(offset_m=0.08)(observed(10, 8))[part]
+    estimate = fit_extrinsic(observations, BOARD, SETTINGS)
+    hypothesis = hypothesis_of(estimate, ())
+    *_, reason = find_causes(hypothesis, estimate, CalibrationSettings(), ALL)
+    assert reason.gain.cause == "range_offset"
+    assert reason.after.state.lasers[0].mean() == pytest.approx(0.08, abs=0.02)
 
 
 @pytest.mark.long

@@ -98,6 +98,12 @@ class Hypothesis:
         fitted = fit_levels(self.terms, self.levels, usual, self.priors, _LEVEL_ROUNDS, OF_IMAGES)
         return replace(self, levels=fitted)
 
+    def with_noise_up_to(self, ratio: float) -> "Hypothesis":
+        """Return a copy whose images' errors have at most this ratio to their usual levels."""
+        usual = self.levels.with_usual_images
+        most = {name: min(getattr(self.levels, name), ratio * getattr(usual, name)) for name in OF_IMAGES}
+        return replace(self, levels=replace(self.levels, **most))
+
     def under(
         self,
         priors: Priors | None = None,
