@@ -17,6 +17,8 @@ FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
 SIGMA_PER_MAD = 1.4826
 """Standard deviation of normal noise over its median magnitude."""
+HUBER = 1.5
+"""Number of standard deviations beyond which an error's weight decreases (95 % efficient)."""
 SURPRISING_CHI2 = 16.81
 """Chi-squared, of six degrees of freedom, of poses above which they differ: 99 %."""
 EVEN_STEPS = (1 / 1.2207440846057596) ** np.arange(1, 4)

@@ -21,7 +21,7 @@ from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import SILENCE_S, LiveSource, RateMeter, SourceStatus
+from lce_rig.devices.reading import CAMERA_SILENCE_S, LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
@@ -74,7 +74,7 @@ class DavisSource(LiveSource):
         settings: CameraSettings,
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
     ) -> None:
-        super().__init__(sensor, f"camera {sensor!r}", SILENCE_S, _SILENT_HINT, _N_SLOTS)
+        super().__init__(sensor, f"camera {sensor!r}", CAMERA_SILENCE_S, _SILENT_HINT, _N_SLOTS)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._opened = OpenedCamera(None, "")

@@ -23,7 +23,7 @@ MAX_LOST_SHARE, MAX_OFF_RATE = 0.01, 0.05
 
 A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
 """
-SILENCE_S = 5.0
+CAMERA_SILENCE_S = 5.0
 """Longest silence before a camera counts as lost."""
 READ_WAIT_S = 0.25
 """Longest wait of a driver for data: a source's thread ends no later."""

@@ -9,14 +9,15 @@ from typing import Any
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
-from lce_rig.devices.reading import READ_WAIT_S, SILENCE_S, LiveSource, SourceStatus
+from lce_rig.devices.reading import READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.rosbag import TopicDecoder
 from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 
-# Time for discovery, s: nodes find each other within a second on one computer, within a few on a network.
-_DISCOVERY_S = SILENCE_S
+# Longest silence, and time for discovery, s: nodes find each other within a second on one computer, within a
+# few on a network.
+_SILENCE_S = _DISCOVERY_S = 5.0
 _DISCOVERY_STEP_S = 0.1
 
 
@@ -41,7 +42,7 @@ class Ros2Source(LiveSource):
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
         hint = f"Check that its driver publishes: `ros2 topic hz {self._topic}`."
-        super().__init__(sensor, label, SILENCE_S, hint)
+        super().__init__(sensor, label, _SILENCE_S, hint)
         self._settings = settings
         self._stack = ExitStack()
         self._waiting: list[tuple[int, bytes]] = []

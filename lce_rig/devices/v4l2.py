@@ -21,7 +21,7 @@ from lce_rig.core.phrasing import significant
 from lce_rig.devices import findings
 from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.devices.reading import READ_WAIT_S, SILENCE_S, LiveSource, SourceStatus
+from lce_rig.devices.reading import CAMERA_SILENCE_S, READ_WAIT_S, LiveSource, SourceStatus
 from lce_rig.devices.video_device import (
     VideoDevice,
     apply_controls,
@@ -196,7 +196,7 @@ class V4l2Source(LiveSource):
         silence_s: time without an image that is an error.
     """
 
-    def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = SILENCE_S) -> None:
+    def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = CAMERA_SILENCE_S) -> None:
         super().__init__(sensor, f"camera {sensor!r}", silence_s, _SILENT_HINT)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"

@@ -19,9 +19,14 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, composition_slopes, invert
 from lce_rig.judge.causes import describe_move
-from lce_rig.judge.explanations import LEAST, WIDE, Explanation, Table, score_test
+from lce_rig.judge.explanations import Explanation, Table, score_test
 from lce_rig.judge.findings import MOVED
 from lce_rig.judge.validate import Validation
+
+# Lead of a sensor over the next one, log10 of the probability: the pairs are not independent.
+_LEAD = 4.0
+# Standard deviation, m and rad, of motions that captures must determine better.
+_KNOWN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ def find_moved_sensor(pairs: Sequence[PairCosts]) -> MovedSensor | None:
     ranked = sorted(motions, key=lambda each: each.log10_chance)
     # At most two sensors are part of all pairs that show a motion.
     next_chance = ranked[1].log10_chance if len(ranked) > 1 else 0.0
-    return ranked[0] if ranked and ranked[0].log10_chance < next_chance + LEAST else None
+    return ranked[0] if ranked and ranked[0].log10_chance < next_chance - _LEAD else None
 
 
 def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
@@ -151,7 +156,7 @@ def _motions(sensor: str, pairs: Sequence[PairCosts]) -> Iterator[MovedSensor]:
         for captures, poses, A in own:
             slope, information = poses.score(np.array([float(name >= first_after) for name in captures]))
             h, S = h + A.T @ slope, S + A.T @ information @ A
-        found = score_test(Explanation("moved", np.empty(0)), h, S, WIDE)
+        found = score_test(Explanation("moved", np.empty(0)), h, S, _KNOWN)
         yield MovedSensor(sensor, first_after, found.log10_chance, shown)
 
 

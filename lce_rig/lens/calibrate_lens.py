@@ -43,9 +43,10 @@ _CHANCE = 0.02 / 3
 _SCATTER_ROUNDS = 3
 # Corners with residuals this many times the typical value of their channel are outliers.
 _BAD = 4.0
-# Variance ratio below which a direction is undetermined: relative to the largest variance, the prior
-# determines it; as the other captures' share, a single capture does and cannot be compared with others.
+# Directions of the intrinsics with a smaller share of the largest variance are the prior's.
 _DETERMINED = 1e-3
+# A single capture that determines a direction cannot be compared with others.
+_LEAST_REST = 1e-3
 # A focal length with a larger relative standard deviation is undetermined.
 _MAX_FOCAL_SIGMA = 0.1
 
@@ -278,7 +279,7 @@ def _scatter_ratio(setup: Setup, state: LensState, weights: Array, captures: NDA
     for capture in range(int(captures.max()) + 1):
         own = captures == capture
         values, vectors = np.linalg.eigh(back @ information[own].sum(axis=0) @ back.T)
-        e = vectors.T @ back @ gradients[own].sum(axis=0) / np.sqrt(np.maximum(1.0 - values, _DETERMINED))
+        e = vectors.T @ back @ gradients[own].sum(axis=0) / np.sqrt(np.maximum(1.0 - values, _LEAST_REST))
         moves.append((back.T @ vectors @ e)[:P])
     sigma = np.sqrt(np.diag(expected)[:P])
     variances, axes = np.linalg.eigh(expected[:P, :P] / np.outer(sigma, sigma))

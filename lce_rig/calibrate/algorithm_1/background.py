@@ -19,7 +19,7 @@ from lce_rig.calibrate.plane_and_ends import (
     end_rows,
 )
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import HUBER, Array
 from lce_rig.core.results import Observation
 
 BACKGROUND_SIGMAS_M = (EDGE_SHIFT_SIGMA_M, 0.01, EDGE_SHIFT_SIGMA_M)
@@ -28,8 +28,6 @@ BACKGROUND_SIGMAS_M = (EDGE_SHIFT_SIGMA_M, 0.01, EDGE_SHIFT_SIGMA_M)
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
 _END_SIGMA_M = 0.003  # noise of a ring end
-HUBER = 1.5
-"""Number of standard deviations beyond which a weight decreases (95 % efficient)."""
 _ROUNDS = 5
 # Groups of columns tested for significance: all, far background, near background.
 _TOGETHER = ((0, 1, 2), (0,), (1, 2))

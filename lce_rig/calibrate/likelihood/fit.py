@@ -14,7 +14,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.algorithm_1.background import HUBER
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import EXACT, LOG_SIGMA, MOST_LOST, Levels, Priors
@@ -24,7 +23,7 @@ from lce_rig.calibrate.observations import group_poses
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, invert, perturb
+from lce_rig.core.geometry import HUBER, Array, invert, perturb
 from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
 
 # Maximum number of steps between two fits of the levels, and after the last one.

@@ -33,7 +33,6 @@ from lce_rig.detect.lidar.outline import (
 from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
     LAYER_M,
-    MARGIN_M,
     STANDARD,
     Limits,
     board_at,
@@ -56,6 +55,8 @@ _MOST_PATCHES = 8
 _ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
+_NOISE_M = 0.012  # maximum noise of a plane's returns, assumed until the cloud's own is measured
+_SURROUND_M = 0.25
 _MIN_POINTS = 60
 # Approximate error of the directions of a rosette's beams, rad.
 _DIRECTION_RAD = 7e-4
@@ -139,7 +140,7 @@ def look_for_unstructured_board(
 
 def _rays_about(points: Array | Floats, centre: Array, board: Board) -> NDArray[np.bool_]:
     """Find the rays (N,) that pass the board's centre closely enough to locate its border."""
-    reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + MARGIN_M
+    reach_m = 0.7 * float(np.hypot(board.width_m, board.height_m)) + _SURROUND_M
     squared_cosine = 1.0 / (1.0 + (reach_m / np.linalg.norm(centre)) ** 2)
     along = points @ (centre / np.linalg.norm(centre)).astype(points.dtype)
     squared_m2 = np.einsum("ij,ij->i", points, points)
@@ -167,7 +168,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     plane, _, eigenvalues = fit_planes(around)
     normal = plane[:, :3]
     flat = (around[:, 0] >= _MIN_CELL_POINTS) & (eigenvalues[:, 1] > (0.35 * cell_m) ** 2)
-    flat &= eigenvalues[:, 0] < (2.0 * STANDARD.rms_m) ** 2
+    flat &= eigenvalues[:, 0] < (2.0 * _NOISE_M) ** 2
     if not flat.any():
         return Plates.none()
     i, j = pairs.take(np.flatnonzero(flat[pairs].all(axis=1)), axis=0).T
@@ -175,7 +176,7 @@ def grow_patches(points: Array, cell_m: float) -> Plates:
     apart = centres.take(j, axis=0) - centres.take(i, axis=0)
     joined = np.abs(np.einsum("ij,ij->i", of_i, of_j)) > _SAME_NORMAL
     for side in (of_i, of_j):
-        joined &= np.abs(np.einsum("ij,ij->i", side, apart)) < 2.5 * STANDARD.rms_m
+        joined &= np.abs(np.einsum("ij,ij->i", side, apart)) < 2.5 * _NOISE_M
     graph = coo_array((np.ones(joined.sum()), (i[joined], j[joined])), shape=(n_cells, n_cells))
     n_patches, label = connected_components(graph, directed=False)
     count = np.bincount(label)
@@ -325,7 +326,7 @@ def measure_unstructured(
     half_m = (board.width_m / 2, board.height_m / 2)
     returns = returns[_rays_about(returns[:, :3], centre, board)]
     returns = returns[thin(len(returns), _MOST_MEASURED)]
-    view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * STANDARD.rms_m, limits)
+    view = _View.of(returns[thin(len(returns), _ROUGH)], plane, centre, 4 * _NOISE_M, limits)
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:

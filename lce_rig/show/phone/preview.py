@@ -15,7 +15,7 @@ from aiohttp import web
 from lce_rig.collect.live.state import LiveState, TakeBack
 from lce_rig.core.errors import UsageError
 from lce_rig.show.phone import DEFAULT_PORT, LOOPBACK
-from lce_rig.show.phone.pages import ANSWER_S, BEAT_S, GOODBYE_S, Feed, Pages
+from lce_rig.show.phone.pages import Feed, Pages
 
 _HINT = (
     "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080: an address of this computer "
@@ -86,6 +86,9 @@ def _network_addresses() -> list[str]:
 
 # 72 bits: beyond guessing, and can still be typed into a phone.
 _TOKEN_BYTES = 9
+_STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
+# Time to read the rest of a request that was answered before its end, s.
+_LINGERING_S = 1.0
 # asyncio sets up a connection in the three turns of its loop after it has accepted it.
 _TURNS_TO_SET_UP = 4
 # Malformed requests from strangers must not be logged on the terminal that shows the collection.
@@ -153,7 +156,7 @@ class Preview:
         if self._thread.is_alive():
             with suppress(RuntimeError):  # the loop has just ended on its own
                 self._loop.call_soon_threadsafe(self._stop.set)
-            self._thread.join(3 * GOODBYE_S)
+            self._thread.join(_STOP_S)
         self._thread = None
 
     def __enter__(self) -> "Preview":
@@ -182,10 +185,9 @@ class Preview:
             handle_signals=False,
             access_log=None,
             logger=_SILENT,
-            shutdown_timeout=GOODBYE_S,
-            keepalive_timeout=ANSWER_S,
-            # To read the rest of a request that was answered before its end.
-            lingering_time=BEAT_S,
+            shutdown_timeout=_SHUTDOWN_S,
+            keepalive_timeout=_KEEP_ALIVE_S,
+            lingering_time=_LINGERING_S,
         )
         await runner.setup()
         await web.SockSite(runner, opened).start()
