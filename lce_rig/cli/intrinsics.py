@@ -69,7 +69,7 @@ def intrinsics(
     --force, then `calibrate --rig FILE`) their extrinsics differ less.
     """
     every = [Session.open(path) for path in sessions or (Path("session"),)]
-    opened, session = every[0], every[0].path
+    opened = every[0]
     require_sensors("camera", cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
@@ -99,7 +99,8 @@ def intrinsics(
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
         show.note(f"  written      {save_profile}, with new intrinsics of {', '.join(replaced)}")
-        show.name_next("calibrate", session, f" --rig {save_profile}")
+        for each in every:
+            show.name_next("calibrate", each.path, f" --rig {save_profile}")
         for one in measured:
             if one.judgement.code != "intrinsics.better":
                 how = "new intrinsics forced" if one.camera in replaced else "intrinsics kept"

@@ -416,13 +416,13 @@ TWO_BOARDS = Kind(
 )
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",
-    "the session determines the intrinsics better than the profile ({covered:percent} of the image covered, "
+    "the boards determine the intrinsics better than the profile ({covered:percent} of the image covered, "
     "{image_sigma_px:.2f} px near its border)",
     "write them into one: `lce-rig intrinsics {session} --save-profile FILE`",
     severity="note",
 )
 INTRINSICS_FIT = Kind(
-    "intrinsics.fit", "the profile's intrinsics fit the boards of the session", "keep them", severity="note"
+    "intrinsics.fit", "the profile's intrinsics fit the boards", "keep them", severity="note"
 )
 INTRINSICS_UNDETERMINED = Kind("intrinsics.undetermined", _reach, _CORNERS_TOO, severity="warning")
 MOVED = Kind("verdict.moved", _moved, "fasten the sensors and collect again")

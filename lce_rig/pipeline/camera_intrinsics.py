@@ -38,6 +38,7 @@ from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
+from lce_rig.pipeline.comparison import require_independent, require_same
 from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, lens_settings, parse_rig, set_value
@@ -115,7 +116,7 @@ def measure_intrinsics(
     again with the fitted ones.
 
     Args:
-        sessions: at least one, open for reading; camera and board are the same in all.
+        sessions: at least one, open for reading, of one rig and board.
         camera: the camera's name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or else of events.
@@ -123,12 +124,17 @@ def measure_intrinsics(
         progress: called with (done, total).
 
     Raises:
-        UsageError: no such channel or model, or sessions of different cameras or boards.
+        UsageError: no such channel or model.
+        SessionError: sessions of different rigs, intrinsics or boards, or with the same captures.
         NotEnoughDataError: too few images show the board, or the focal length is undetermined.
     """
     rig = sessions[0].rig
-    for session in sessions[1:]:
-        _require_same(session, sessions[0], camera)
+    named = {str(session.path): session for session in sessions}
+    require_same(named)
+    for name, session in named.items():
+        if session.rig.board != rig.board:
+            raise SessionError(f"{name} has another board than the first", "Give sessions of one board.")
+    require_independent(named)
     if model not in (None, *MODELS):
         raise UsageError(f"unknown lens model {model!r}; choose one of: {', '.join(MODELS)}")
     have = rig.cameras[camera].channels
@@ -185,21 +191,6 @@ def measure_intrinsics(
         weaknesses=find_weaknesses(estimate, certainty),
         refused=dict(sorted({**refused, **estimate.refused}.items())),
     )
-
-
-def _require_same(session: Session, first: Session, camera: str) -> None:
-    """Refuse a session of another camera or board than the first one's."""
-    if camera not in session.rig.cameras:
-        held = ", ".join(session.rig.cameras)
-        raise UsageError(f"{session.path}: no camera {camera}", f"Choose with --camera of: {held}.")
-    if session.rig.board != first.rig.board:
-        raise UsageError(f"{session.path} has another board than {first.path}", "Give sessions of one board.")
-    lenses = [each.rig.cameras[camera].to_intrinsics() for each in (session, first)]
-    if lenses[0] != lenses[1]:
-        raise UsageError(
-            f"{session.path} has other intrinsics of {camera} than {first.path}",
-            "Calibrate all sessions with one profile first: `lce-rig calibrate SESSION --rig FILE`.",
-        )
 
 
 def _images_of(

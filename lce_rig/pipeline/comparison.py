@@ -88,8 +88,8 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     if len(paths) < 2:
         raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
     sessions = dict(zip(_session_names(paths), (Session.open(path) for path in paths), strict=True))
-    _require_same(sessions)
-    _require_independent(sessions)
+    require_same(sessions)
+    require_independent(sessions)
     results = {label: _read(each, result_folder(each.path, name)).pairs for label, each in sessions.items()}
     first_name, first = next(iter(sessions.items()))
     other_boards = [
@@ -115,7 +115,7 @@ def _session_names(paths: Sequence[Path]) -> list[str]:
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
-def _require_same(sessions: Mapping[str, Session]) -> None:
+def require_same(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions of different rigs, or with other intrinsics.
 
     Raises:
@@ -136,7 +136,7 @@ def _require_same(sessions: Mapping[str, Session]) -> None:
             )
 
 
-def _require_independent(sessions: Mapping[str, Session]) -> None:
+def require_independent(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions that share images or scans: a copy always agrees with its original."""
     hashes: dict[str, set[str]] = {name: set() for name in sessions}
     for name, session in sessions.items():

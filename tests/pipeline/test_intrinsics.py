@@ -1,5 +1,6 @@
 """Intrinsics of a session with a possibly wrong profile: estimated, compared and written."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -130,7 +131,8 @@ def test_sessions_of_one_camera_share_a_lens(pictures, tmp_path):
     "changes, message",
     [
         ({"board.square_m": "0.05"}, "has another board than"),
-        ({"cameras.davis.intrinsics.fx_px": "300.0"}, "has other intrinsics of davis than"),
+        ({"cameras.davis.intrinsics.fx_px": "300.0"}, "differ: cameras.davis.intrinsics.fx_px"),
+        ({"name": "other"}, "to rig 'other'"),
     ],
 )
 def test_sessions_of_different_profiles_are_refused(session, pictures, tmp_path, changes, message):
@@ -139,8 +141,14 @@ def test_sessions_of_different_profiles_are_refused(session, pictures, tmp_path,
         text = set_value(text, key, value)
     with Session.create(tmp_path / "other", parse_rig(text)) as other:
         other.add_capture([Image("davis", "frames", None, pictures[0])], [], {})
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises(SessionError, match=message):
         measure_intrinsics([session, other], "davis")
+
+
+def test_a_copy_of_a_session_adds_nothing_to_its_lens(session, tmp_path):
+    shutil.copytree(session.path, tmp_path / "copy")
+    with pytest.raises(SessionError, match="share 8 samples"):
+        measure_intrinsics([session, Session.open(tmp_path / "copy")], "davis")
 
 
 def test_every_file_holds_the_same_lens(session, measured, tmp_path):
