@@ -23,8 +23,8 @@ from lce_rig.core.results import Observation
 _MIN_EXPLAINED, _SHARE = 5, 0.75
 # Minimum number of captures with an error when the others have a consensus.
 _MIN_OF_SOME = 2
-# Reflections of an image, left to right and top to bottom: factors of the camera's axes. The first one's are
-# also those of the board's.
+# Reflections of an image, left to right and top to bottom: factors of the camera's axes. The first row
+# holds for the board's axes, too.
 _MIRRORS = np.array([[-1, 1, 1, 1], [1, -1, 1, 1]])
 
 Candidates = Sequence[Observation]

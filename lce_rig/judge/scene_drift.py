@@ -67,7 +67,7 @@ class SceneDrift:
         cov: (6, 6) of these.
         estimate: estimate of the scene.
         n_captures: compared.
-        gain: significance of a changed estimate's score over that of the deployed extrinsics.
+        gain: significance of a changed estimate's score over that of the deployed extrinsics (`gain_over`).
         others: further findings; clocks apart prevent an all-clear.
     """
 
@@ -96,7 +96,7 @@ class SceneDrift:
         sizes = {"smallest_deg": smallest_deg, "smallest_m": smallest_m}
         if estimate.state == "few_edges":
             return FEW_EDGES(n_edges=estimate.n_edges, n_captures=self.n_captures)
-        if not self._is_located:
+        if not self.is_located:
             return (WEAK if estimate.state == "weak" else BEYOND_REACH)()
         if self.change.is_changed:
             if self.gain < MIN_GAIN:
@@ -109,7 +109,7 @@ class SceneDrift:
         return (DOUBTFUL if self.change.chi2 > SURPRISING_CHI2 else UNCHANGED)(**sizes)
 
     @property
-    def _is_located(self) -> bool:
+    def is_located(self) -> bool:
         """Whether there is a best fit; among several, one near the deployed extrinsics supports these."""
         return self.estimate.state in ("usable", "ambiguous")
 
@@ -140,7 +140,7 @@ class SceneDrift:
     def opinion(self) -> SceneOpinion:
         """The comparison as a result keeps it."""
         n_captures, n_edges, change = self.n_captures, self.estimate.n_edges, self.change
-        if not self._is_located:
+        if not self.is_located:
             return SceneOpinion(n_captures, n_edges)
         return SceneOpinion(n_captures, n_edges, _OPINIONS[self.state], change.tangent, change.cov)
 
@@ -156,6 +156,7 @@ class SceneDrift:
             "change": self.change.tangent.tolist(),
             "covariance": self.change.cov.tolist(),
             "chi2": self.change.chi2,
+            "gain": self.gain if np.isfinite(self.gain) else None,
         }
 
 
@@ -170,6 +171,6 @@ def watch_scene(views: Sequence[OutlineView], lens: Intrinsics, calibration: Cal
     c = calibration
     estimate = estimate_scene(views, lens, c.T_cam_lidar)
     drift = SceneDrift(c.T_cam_lidar, c.cov, estimate, len(views))
-    if not drift.change.is_changed:
+    if not (drift.is_located and drift.change.is_changed):
         return drift
     return replace(drift, gain=gain_over(estimate, views, lens, c.T_cam_lidar, c.cov))

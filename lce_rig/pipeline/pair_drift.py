@@ -96,10 +96,11 @@ class PairDrift:
 
     @property
     def advice(self) -> str:
-        """The action of the first finding that decides the verdict."""
+        """The action of the first finding that decides the verdict; of notes, where nothing else has one."""
         if self.state == "unchanged":
             return ""
-        return next((each.advice for each in self.findings if each.severity != "note" and each.advice), "")
+        ranked = sorted(self.findings, key=lambda each: each.severity == "note")
+        return next((each.advice for each in ranked if each.advice), "")
 
     def document(self) -> dict[str, Any]:
         """Return all figures as plain types for JSON."""

@@ -235,15 +235,15 @@ def gain_over(
 ) -> float:
     """Compute the significance of an estimate's score over that of other extrinsics within their errors.
 
-    Edges that hardly determine a direction, as poles do for the height, have far maxima by chance, with a
-    small covariance: on recorded rlfs03 193 +- 30 mm too low.
+    Where edges hardly determine a direction, such as poles the height, a far maximum may score highest by
+    chance, and its own covariance is small: on recorded rlfs03, 193 +- 30 mm too low.
 
     Args:
         estimate: the estimate.
         views: its views.
         intrinsics: intrinsics of the camera.
         T_cam_lidar: (4, 4) the other extrinsics.
-        cov: (6, 6) of these; they are fitted within some sigma of it and of the scene's own bias.
+        cov: (6, 6) of these. They are fitted within two standard deviations of it and the scene's bias.
     """
     views = [view for view in views if len(view.outlines)]
     score = OutlineScore(views, intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)

@@ -67,6 +67,7 @@ BOARD_HIDES = Kind(
     "scene.board_hides",
     "boards: {rotation:motion} by {rotation_deg:deg} with {translation:motion} by {translation_m:mm}, "
     "or less, would not be seen",
+    "hold the board at more places",
     severity="note",
 )
 CONTRADICTION = Kind(

@@ -67,6 +67,14 @@ def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float,
     assert (pair.findings[0].code == "scene.contradiction") == (state == "unknown")
 
 
+def test_board_drift_hidden_direction_is_unknown() -> None:
+    sigmas = np.r_[np.full(3, 0.05), np.radians([0.05, 0.05, 0.05])]
+    board = BoardDrift(np.zeros(6), np.diag(sigmas**2), 2.0, 3, 3)
+    assert board.state == "unknown"
+    assert [each.code for each in board.findings] == ["scene.board_hides"]
+    assert board.findings[0].advice == "hold the board at more places"
+
+
 def test_watch_boards_one_outlier_keeps_the_verdict() -> None:
     calibration = deployed(np.zeros(6))
     detections = seen_by(calibration, 1)

@@ -10,7 +10,14 @@ from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import MODELS
 from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid
-from lce_rig.scene.estimate import REACH, estimate_scene, find_better_focal, follow_lens
+from lce_rig.scene.estimate import (
+    MIN_GAIN,
+    REACH,
+    estimate_scene,
+    find_better_focal,
+    follow_lens,
+    gain_over,
+)
 from lce_rig.scene.outline_score import OutlineScore, build_outline_view
 from lce_rig.scene.outlines import LEVEL, UPRIGHT, find_outlines
 from tests.scene.conftest import COV
@@ -54,6 +61,12 @@ def test_estimate_rough_start_covers_truth(views, start):
     assert found.chi2(TRUTH) < 16.81
     turn_deg, shift_m = tangent_sizes(difference(found.T_cam_lidar, TRUTH))
     assert turn_deg < 0.1 and shift_m < 0.02
+
+
+def test_gain_over_changed_extrinsics_exceeds_that_over_the_truth(views, found):
+    lower = perturb(TRUTH, np.array([0.0, 0.19, 0.0, 0.0, 0.0, 0.0]))
+    assert gain_over(found, views, LENS, TRUTH, COV) < MIN_GAIN / 2
+    assert gain_over(found, views, LENS, lower, COV) > MIN_GAIN
 
 
 @pytest.mark.long

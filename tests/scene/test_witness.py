@@ -11,6 +11,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import MOTIONS, ChannelResult, SceneOpinion, read_result
 from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.judge.verdict import with_opinion
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.verification import verify
 from lce_rig.pipeline.witness import hear_scene, scene_views
@@ -99,6 +100,19 @@ def session_of(seen, path, images_of):
         for capture in seen.captures:
             session.add_capture(images_of(capture), capture.scans, {})
     return Session.open(path)
+
+
+@pytest.mark.long
+def test_scene_of_poles_contradicts_no_sound_extrinsics(recordings, tmp_path):
+    words = ["collect", "--rig", "rlfs", "--channel", "frames", "--from", str(recordings / "rlfs03")]
+    assert run([*words, str(tmp_path / "session")]) == 0
+    session = Session.open(tmp_path / "session")
+    detections = detect_boards(session)
+    (sound, *_), _ = calibrate_detections(session.rig, detections)
+    rng, spread = np.random.default_rng(1), np.linalg.cholesky(sound.cov)
+    for _ in range(4):
+        drawn = replace(sound, T_cam_lidar=perturb(sound.T_cam_lidar, spread @ rng.normal(size=6)))
+        assert hear_scene(session, detections, drawn).state != "contradicts"
 
 
 def test_scene_without_features_changes_no_verdict(seen, tmp_path):
