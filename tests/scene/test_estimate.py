@@ -63,7 +63,7 @@ def test_estimate_rough_start_covers_truth(views, start):
     assert turn_deg < 0.1 and shift_m < 0.02
 
 
-def test_gain_over_changed_extrinsics_exceeds_that_over_the_truth(views, found):
+def test_gain_over_changed_extrinsics_exceeds_that_of_truth(views, found):
     lower = perturb(TRUTH, np.array([0.0, 0.19, 0.0, 0.0, 0.0, 0.0]))
     assert gain_over(found, views, LENS, TRUTH, COV) < MIN_GAIN / 2
     assert gain_over(found, views, LENS, lower, COV) > MIN_GAIN
