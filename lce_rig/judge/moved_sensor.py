@@ -96,6 +96,8 @@ class MovedSensor:
         """Report the motion for a pair of this sensor: a note if its result uses only captures after it."""
         held = pair.used if pair.hypothesis is None else pair.hypothesis.captures
         move = describe_move(held, sum(name < self.first_after for name in held))
+        if move["place"] == "first":
+            move["neighbour"] = self.first_after  # of any pair: this one may lack the capture
         return replace(
             self.shown,
             severity=self.shown.severity if self.is_within(pair) else "note",
