@@ -56,25 +56,25 @@ Cause = Literal[
 ]
 MOUNTINGS: tuple[Cause, ...] = ("moved", "groups", "alone", "drift")
 """Causes that change the extrinsics during the session."""
-LEAST = -4.0
-"""Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried."""
+# Significance limit, log10 of the probability, corrected for all explanations of the kind that are tried.
+_LEAST = -4.0
 # The same of explanations that are settled. Ring ends far from their edges count as strays, and (2)
 # understates their gain: a move of 0.8 deg before the last 3 of 15 simulated captures has -3.8,
 # settled -146.
 _TRIED = -2.0
-WIDE = 0.2
-"""Prior standard deviation of freed errors, m, rad or a fraction: the size of users' mistakes."""
+# Prior standard deviation of freed errors, m, rad or a fraction: the size of users' mistakes.
+_WIDE = 0.2
 _FREED: Mapping[Cause, Mapping[str, Any]] = {
-    "squares": {"squares": WIDE},
-    "pattern": {"pattern_m": WIDE},
-    "plate": {"plate_m": WIDE},
-    "bow": {"bow_m": WIDE},
+    "squares": {"squares": _WIDE},
+    "pattern": {"pattern_m": _WIDE},
+    "plate": {"plate_m": _WIDE},
+    "bow": {"bow_m": _WIDE},
     "lens": {"optics": 100.0},  # in standard deviations of the profile
-    "range_offset": {"offset_m": WIDE},
-    "range_scale": {"stretch": WIDE},
-    "range_contrast": {"contrast_m": WIDE},
-    "azimuths": {"azimuth_rad": WIDE, "known": None},
-    "elevations": {"elevation_rad": WIDE, "known": None},
+    "range_offset": {"offset_m": _WIDE},
+    "range_scale": {"stretch": _WIDE},
+    "range_contrast": {"contrast_m": _WIDE},
+    "azimuths": {"azimuth_rad": _WIDE, "known": None},
+    "elevations": {"elevation_rad": _WIDE, "known": None},
 }
 CONSTANT: tuple[Cause, ...] = tuple(_FREED)
 """Causes that are the same in all captures."""
@@ -180,7 +180,7 @@ class Poses(NamedTuple):
         """Compute (2) for a change of the extrinsics."""
         D = _AXES[:, 2:3] if explanation.cause == "focus_drift" else _AXES
         h, S = self.score(explanation.weights)
-        found = score_test(explanation, D.T @ h, D.T @ S @ D, WIDE)
+        found = score_test(explanation, D.T @ h, D.T @ S @ D, _WIDE)
         return found._replace(value=D @ found.value)
 
     def score(self, weights: Array) -> tuple[Array, Array]:
@@ -350,7 +350,7 @@ class Table:
     def _gain(self, explanation: Explanation) -> Gain:
         """Compute (2) for a constant error."""
         c, w, D = self.cost, explanation.weights, self._columns(explanation.cause)
-        sigma = next(iter(_FREED.get(explanation.cause, {"": WIDE}).values()))
+        sigma = next(iter(_FREED.get(explanation.cause, {"": _WIDE}).values()))
         by_z = np.tensordot(w, c.hessians, axes=1) @ D
         hessian = D.T @ np.tensordot(w**2, c.hessians, axes=1) @ D
         h = D.T @ (w @ c.gradients) + by_z.T @ self.step
@@ -442,7 +442,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         for row in constant:
             if row.cause in CONSTANT and (row.cause, 0) not in once and row.log10_chance < _rank(best):
                 best = min(best, _assume(hypothesis, noisy, row), key=_rank)
-        if best.gain.log10_chance > LEAST:
+        if best.gain.log10_chance > _LEAST:
             return
         yield best
         if best.after is hypothesis:
@@ -522,4 +522,4 @@ def _misfits(after: Hypothesis, others: NDArray[np.bool_]) -> NDArray[np.bool_]:
     poses = Table(after, frozenset()).poses
     singles = poses.singles(poses.gradient)
     unit = _unit(singles[others])
-    return np.array([log10_chance(chi2 / unit, 6) < LEAST for chi2 in singles.tolist()])
+    return np.array([log10_chance(chi2 / unit, 6) < _LEAST for chi2 in singles.tolist()])

@@ -49,14 +49,13 @@ _KNOWN_PX = (1.0, 5.0)
 _OTHER_LENS = 36.0
 # Limit of residuals in the median image, in units of the noise, beyond which the lens is another one: 0.5 to
 # 1.1 in 17 sound sessions, 11 of them recorded; 6 for a fisheye lens entered as radtan. Twice that fails.
-# Another model must fit better by the same factor.
-_MISFIT = 2.0
+_MISFIT, _FAIL = 2.0, 2.0
 # Variance of shears along the image's rows in the median image, in units of the corners' noise: in ten sound
 # recordings 0.1 to 2.0, in three of them with rows read out over 20 ms while boards move at 0.15 m/s 0.3
 # (corner noise 0.2 px), 8 and 11. Shears are printed per 100 rows.
 _READOUT, _ROWS = 4.0, 100.0
-# Largest ratio of the residuals of models that fit about equally well.
-_ALIKE = 1.25
+# Least ratio of the residuals of the profile's model and of one that fits; largest of models that fit alike.
+_NEARER, _ALIKE = 2.0, 1.25
 _DEGREE, _LEAST_FREEDOMS = 3, 8
 
 
@@ -256,15 +255,15 @@ def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
     # Among models that fit about equally well, choose the one with the fewest parameters.
     near = [name for name, px in reached.items() if px < _ALIKE * least_px]
     best = min(near, key=lambda name: MODELS[name].size, default="")
-    if _MISFIT * least_px > fitted.rms_px:
+    if _NEARER * least_px > fitted.rms_px:
         if sheared := _readout(fitted, noise_px):
             return sheared
         best = ""
-    elif reached.get(own, np.inf) < _MISFIT * least_px:
+    elif reached.get(own, np.inf) < _NEARER * least_px:
         return []
     typical_px = float(np.nanmedian(noise_px))
     finding = LENS_MODEL(
-        severity=failing(fitted.rms_px > _MISFIT**2 * typical_px),
+        severity=failing(fitted.rms_px > _FAIL * _MISFIT * typical_px),
         action="" if best else "none",
         model=own,
         rms_px=fitted.rms_px,

@@ -30,7 +30,7 @@ _BEYOND = 1.5  # Largest distance from the start, in reaches
 
 # Chosen on KITTI's views, simulated rooms and streets, and boards of os1_64, acfr_vlp16, rlfs01 and rlfs02.
 _INFLATION = 2.0  # of standard deviations: neighbouring blocks share surfaces
-_BIAS = np.array([*[0.02] * 3, *np.radians([0.03, 0.03, 0.06])])
+_BIAS = np.array([0.02, 0.02, 0.02, *np.radians([0.03, 0.03, 0.06])])
 """Standard deviation of errors that all edges of a scene share: beam width, lens, time. m, rad."""
 _LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
 
@@ -43,8 +43,7 @@ _NOTICED = 27.04
 _CONTROL_SIGMAS = 3.0  # Displacement after which extrinsics must score less.
 _UNDETERMINED = 0.5  # Standard deviation of an undetermined direction, in reaches.
 _LENS_STEP_RAD = 1e-3  # Displacement in the image, by focal length, of a difference by the intrinsics
-# Relative changes of the focal lengths that are compared.
-_FOCAL_STEPS = tuple(0.01 * step for step in (-2, -1, 1, 2))
+_FOCAL_STEPS = (-0.02, -0.01, 0.01, 0.02)  # Relative changes of the focal lengths that are compared.
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def estimate_scene(
         return SceneEstimate(T_start, np.diag(reach**2), "few_edges", 0.0, np.inf, len(views), n_edges, reach)
     thinned = _thinned(views, -(-n_edges // _SEARCH_EDGES))
     levels = [OutlineScore(thinned, intrinsics, T_start, level) for level in range(len(SIGMAS_RAD) - 1)]
-    finest = OutlineScore(views, intrinsics, T_start, len(SIGMAS_RAD) - 1)
+    finest = OutlineScore.finest(views, intrinsics, T_start)
     maxima = _search([*levels, finest], reach)
     best = maxima[0]
     cov = _covariance(finest, best, reach)
@@ -148,14 +147,12 @@ def find_better_focal(
     Returns:
         The best of four steps up to 2 %; None where none is better.
     """
-    views = [view for view in views if len(view.outlines)]
-    level = len(SIGMAS_RAD) - 1
-    own = OutlineScore(views, intrinsics, T_cam_lidar, level)
+    own = OutlineScore.finest(views, intrinsics, T_cam_lidar)
     best_value, better = own.value(np.zeros(6)), None
     for step in _FOCAL_STEPS:
         scale = 1 + step
         lens = replace(intrinsics, fx_px=scale * intrinsics.fx_px, fy_px=scale * intrinsics.fy_px)
-        score = OutlineScore(views, lens, T_cam_lidar, level)
+        score = OutlineScore.finest(views, lens, T_cam_lidar)
         tangent, value = _climb(score, np.zeros(6), REACH)
         if value > best_value and significance(score, tangent, own, np.zeros(6)) > MIN_GAIN:
             best_value, better = value, step
@@ -245,8 +242,7 @@ def gain_over(
         T_cam_lidar: (4, 4) the other extrinsics.
         cov: (6, 6) of these. They are fitted within two standard deviations of it and the scene's bias.
     """
-    views = [view for view in views if len(view.outlines)]
-    score = OutlineScore(views, intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
+    score = OutlineScore.finest(views, intrinsics, T_cam_lidar)
     near, _ = _climb(score, np.zeros(6), _NEAR_SIGMAS / _BEYOND * np.sqrt(np.diag(cov) + _BIAS**2))
     return significance(score, difference(estimate.T_cam_lidar, T_cam_lidar), score, near)
 
@@ -303,15 +299,14 @@ def follow_lens(
         T_cam_lidar: (4, 4) the estimate.
         changes: (P, n) of the parameters of its `model_of`.
     """
-    views = [view for view in views if len(view.outlines)]
-    model, level = model_of(intrinsics), len(SIGMAS_RAD) - 1
+    model = model_of(intrinsics)
     vector, size_px = model.vector(intrinsics), (intrinsics.width_px, intrinsics.height_px)
-    inverse = _inverse_curvature(OutlineScore(views, intrinsics, T_cam_lidar, level), np.zeros(6))
+    inverse = _inverse_curvature(OutlineScore.finest(views, intrinsics, T_cam_lidar), np.zeros(6))
     _, _, by_lens = model.project(vector, grid_rays(intrinsics)[1])
     largest_px = np.abs(by_lens @ changes).max(axis=(0, 1))
     motions = []
     for change, step in zip(changes.T, _LENS_STEP_RAD * intrinsics.fx_px / largest_px, strict=True):
         lenses = [model.intrinsics(vector + sign * step * change, *size_px) for sign in (1, -1)]
-        either = [OutlineScore(views, lens, T_cam_lidar, level).score(np.zeros(6))[1] for lens in lenses]
+        either = [OutlineScore.finest(views, lens, T_cam_lidar).score(np.zeros(6))[1] for lens in lenses]
         motions.append(inverse @ (either[0] - either[1]) / (2 * step))
     return np.stack(motions, axis=1)

@@ -10,7 +10,13 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, perturb, skew, transform
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.edge_pyramid import EdgePyramid, build_edge_pyramid, build_event_pyramid, places
+from lce_rig.scene.edge_pyramid import (
+    SIGMAS_RAD,
+    EdgePyramid,
+    build_edge_pyramid,
+    build_event_pyramid,
+    places,
+)
 from lce_rig.scene.outlines import KINDS_OF_EDGES, LEVEL, Outlines, find_outlines
 
 _BESIDE_RAD = 0.06  # As far as the score is searched: outlines so near the image, or events, are used.
@@ -94,6 +100,14 @@ class OutlineScore:
         ]
         counts_of_layers = [chosen.stop - chosen.start for _, chosen in self._layers]
         self._reduction = np.repeat([layer.reduction for layer, _ in self._layers], counts_of_layers)
+
+    @classmethod
+    def finest(
+        cls, views: Sequence[OutlineView], intrinsics: Intrinsics, T_cam_lidar: Array
+    ) -> "OutlineScore":
+        """Score the views that have outlines on the finest fields; at least one has."""
+        seen = [view for view in views if len(view.outlines)]
+        return cls(seen, intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
 
     def __len__(self) -> int:
         return len(self._points)

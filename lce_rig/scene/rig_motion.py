@@ -10,7 +10,6 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, exp_so3, log_so3
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.scene.edge_pyramid import SIGMAS_RAD
 from lce_rig.scene.estimate import MIN_GAIN
 from lce_rig.scene.outline_score import N_BLOCKS, OutlineScore, OutlineView
 
@@ -144,14 +143,14 @@ def clocks_apart_s(
             outlines = each.view.outlines
             points = each.motion.moved(outlines.points, np.full(len(outlines), after_s))
             later.append(replace(each.view, outlines=replace(outlines, points=points)))
-        score = OutlineScore(later, intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
+        score = OutlineScore.finest(later, intrinsics, T_cam_lidar)
         rows.append(score.edges(np.zeros(6))[0])
-    at_once = OutlineScore([each.view for each in views], intrinsics, T_cam_lidar, len(SIGMAS_RAD) - 1)
+    at_once = OutlineScore.finest([each.view for each in views], intrinsics, T_cam_lidar)
     block = at_once.blocks(at_once.edges(np.zeros(6))[2])
     by_block = np.array([np.bincount(block, row, N_BLOCKS) for row in rows])[:, np.unique(block)]
     total = by_block.sum(axis=1)
     if T_changed is not None:
-        changed = OutlineScore([each.view for each in views], intrinsics, T_changed, len(SIGMAS_RAD) - 1)
+        changed = OutlineScore.finest([each.view for each in views], intrinsics, T_changed)
         if total.max() < (1 - _NEARLY) * changed.value(np.zeros(6)):
             return None
     peak_s = float(_peaks(total[:, None])[0])

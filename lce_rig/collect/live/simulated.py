@@ -36,7 +36,7 @@ WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
 # Fractions of the way, tried one after the other if an obstacle blocks it.
-_SHARES = np.linspace(1, 1 / 4, 4)
+_SHARES = (1.0, 0.75, 0.5, 0.25)
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
 _N_SLOTS = 32
