@@ -38,7 +38,12 @@ from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, certainty_of, profile_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
-from lce_rig.pipeline.comparison import require_independent, require_same
+from lce_rig.pipeline.comparison import (
+    name_sessions,
+    require_independent,
+    require_one_board,
+    require_same,
+)
 from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, lens_settings, parse_rig, set_value
@@ -124,16 +129,14 @@ def measure_intrinsics(
         progress: called with (done, total).
 
     Raises:
-        UsageError: no such channel or model.
+        UsageError: no such channel or model, or a session given twice.
         SessionError: sessions of different rigs, intrinsics or boards, or with the same captures.
         NotEnoughDataError: too few images show the board, or the focal length is undetermined.
     """
     rig = sessions[0].rig
-    named = {str(session.path): session for session in sessions}
+    named = name_sessions(sessions)
     require_same(named)
-    for name, session in named.items():
-        if session.rig.board != rig.board:
-            raise SessionError(f"{name} has another board than the first", "Give sessions of one board.")
+    require_one_board(named)
     require_independent(named)
     if model not in (None, *MODELS):
         raise UsageError(f"unknown lens model {model!r}; choose one of: {', '.join(MODELS)}")

@@ -87,7 +87,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
-    sessions = dict(zip(_session_names(paths), (Session.open(path) for path in paths), strict=True))
+    sessions = name_sessions([Session.open(path) for path in paths])
     require_same(sessions)
     require_independent(sessions)
     results = {label: _read(each, result_folder(each.path, name)).pairs for label, each in sessions.items()}
@@ -101,18 +101,20 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None) -> Repeat:
     return Repeat(first.rig.name, comparisons, (*other_boards, *findings))
 
 
-def _session_names(paths: Sequence[Path]) -> list[str]:
+def name_sessions(sessions: Sequence[Session]) -> dict[str, Session]:
     """Name sessions by their folder, or by their path if two folders have the same name.
 
     Raises:
         UsageError: a session is given twice.
     """
+    paths = [session.path for session in sessions]
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):
         if resolved.count(where) > 1:
             raise UsageError(f"{path} is given twice", "Give independent sessions.")
     short = [path.name for path in resolved]
-    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+    names = short if len(set(short)) == len(short) else [str(path) for path in paths]
+    return dict(zip(names, sessions, strict=True))
 
 
 def require_same(sessions: Mapping[str, Session]) -> None:
@@ -134,6 +136,18 @@ def require_same(sessions: Mapping[str, Session]) -> None:
                 f"the profiles of {first_name} and {name} differ: {'; '.join(keys[:4])}",
                 "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
             )
+
+
+def require_one_board(sessions: Mapping[str, Session]) -> None:
+    """Refuse sessions of different boards.
+
+    Raises:
+        SessionError: the boards differ.
+    """
+    (first_name, first), *others = sessions.items()
+    for name, session in others:
+        if session.rig.board != first.rig.board:
+            raise SessionError(f"{name} has another board than {first_name}", "Give sessions of one board.")
 
 
 def require_independent(sessions: Mapping[str, Session]) -> None:

@@ -25,6 +25,7 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
+from lce_rig.pipeline.comparison import name_sessions, require_independent, require_one_board
 from lce_rig.pipeline.detect_session import detect_boards
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
@@ -51,7 +52,8 @@ def measure_lidar(
         progress: called with (done, total) while a session is read.
 
     Raises:
-        UsageError: sessions of different boards or LiDARs, or a LiDAR without rings.
+        UsageError: no such LiDAR, one without rings or with other range offsets, or a session given twice.
+        SessionError: sessions of different boards, or with the same captures.
         NotEnoughDataError: too few captures that agree.
         ResultRefusedError: a session's boards moved; the captures determine neither the lasers' ranges nor an
             offset of them all.
@@ -59,15 +61,13 @@ def measure_lidar(
     rig = sessions[0].rig
     if not rig.lidars:
         raise UsageError(f"{sessions[0].path}: the rig has no LiDAR to measure", "Give a session of one.")
-    name = lidar or next(iter(rig.lidars))
+    name, named = lidar or next(iter(rig.lidars)), name_sessions(sessions)
+    require_one_board(named)
+    require_independent(named)
     for session in sessions:
         if name not in session.rig.lidars:
             raise UsageError(
                 f"{session.path}: no LiDAR {name}", f"Choose of: {', '.join(session.rig.lidars)}."
-            )
-        if session.rig.board != rig.board:
-            raise UsageError(
-                f"{session.path} has another board than {sessions[0].path}", "Give sessions of one board."
             )
         if session.rig.lidars[name].range_offset_m != rig.lidars[name].range_offset_m:
             raise UsageError(

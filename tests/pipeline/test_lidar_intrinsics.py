@@ -87,3 +87,9 @@ def test_measure_lidar_other_offset_is_refused(tmp_path):
     sessions = [lce.Session.create(tmp_path / f"{k}", each) for k, each in enumerate((rig, other))]
     with pytest.raises(UsageError):
         measure_lidar(sessions, found=[seen(0.0)] * 2)
+
+
+def test_measure_lidar_session_given_twice_is_refused(tmp_path):
+    session = lce.Session.create(tmp_path / "session", lce.load_rig("rlfs"))
+    with pytest.raises(UsageError, match="given twice"):
+        measure_lidar([session, lce.Session.open(session.path)], found=[seen(0.0)] * 2)
