@@ -40,8 +40,9 @@ from lce_rig.rig import CalibrationSettings, Rig
 # Minimum number of captures to test for changes during the session: extrinsics of two or three captures
 # absorb other errors. Constant errors are tested on any number.
 _FEWEST = 6
-# Limit of the images' noise that counts as explained, in usual levels: one standard deviation of their prior.
-_USUAL = 2.0
+MAX_PLANE_MISFIT_M = 0.012
+"""Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
+reach 20 to 30 mm."""
 
 
 def hypothesis_of(estimate: CalibrationEstimate, rejected: Sequence[Observation]) -> Hypothesis | None:
@@ -78,10 +79,13 @@ def find_causes(
     found: list[Selected] = []
     tested = causes if len(estimate.observations) >= _FEWEST else [c for c in causes if c in CONSTANT]
     for selected in explain(hypothesis, tested):
-        found.append(_in_use(selected, estimate))
-        if selected.gain.cause != "alone" and _severity(found[-1].change, target) != "note":
+        found.append(selected)
+        if selected.gain.cause != "alone" and _severity(selected.change, target) != "note":
             break
-    return tuple(found)
+    # After a motion, the extrinsics in use differ by the captures that they rely on, too.
+    if any(each.gain.cause in MOUNTINGS for each in found):
+        return tuple(found)
+    return tuple(_in_use(each, estimate) for each in found)
 
 
 def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
@@ -89,8 +93,6 @@ def _in_use(selected: Selected, estimate: CalibrationEstimate) -> Selected:
 
     Algorithm 1 estimates no constant errors, so its extrinsics may be farther off than the likelihood's.
     """
-    if selected.gain.cause in MOUNTINGS:
-        return selected
     apart = difference(selected.after.T_in_use, estimate.T_cam_lidar)
     cov = estimate.cov + summed_covariance([e for e in estimate.sensitivities if e.source != BY_ALGORITHM_1])
     is_off = float(apart @ np.linalg.solve(cov, apart)) > CHANGED_CHI2
@@ -102,13 +104,13 @@ def report_causes(
 ) -> tuple[list[Finding], list[Sensitivity]]:
     """Report the causes, each with a severity from its displacement of the extrinsics in use.
 
-    The most significant one of the highest severity is the reason. The others are notes, as they may follow
-    from it.
+    The largest displacement is the reason, if it is one. The others are notes, as they may follow from it.
 
     Returns:
         The findings, and the displacement of the extrinsics that resolves the reason, if there is one.
     """
-    named = [(each, _finding(each, estimate, rig, camera, lidar)) for each in selected]
+    by_size = sorted(selected, key=lambda s: -rig.calibration.in_targets(*tangent_sizes(s.change)))
+    named = [(each, _finding(each, estimate, rig, camera, lidar)) for each in by_size]
     found = [finding for _, finding in named if finding is not None]
     reasons = [(f, each) for s in ("error", "warning") for each, f in named if f and f.severity == s]
     if reasons:
@@ -140,8 +142,8 @@ def _displacement(cause: Selected, reason: Finding) -> Sensitivity:
 
 
 def is_explained(selected: Sequence[Selected]) -> bool:
-    """Check whether the causes leave about the usual noise, so that symptoms can follow from them."""
-    return bool(selected) and selected[-1].after.with_fitted_noise.levels.largest_of_images < _USUAL
+    """Check whether the causes leave the planes of both sensors together, so that symptoms follow from them."""
+    return bool(selected) and selected[-1].after.planes_apart_m <= MAX_PLANE_MISFIT_M
 
 
 def _is_over(selected: Selected, used: Sequence[str]) -> bool:

@@ -97,10 +97,10 @@ SCATTER = 4.0
 
 It is two standard deviations of the prior of these levels. Few captures determine their noise by a quarter
 only, so an explanation that leaves more must be more probable with this noise than any noise without it."""
-# The same of images for changes of the mounting. Errors of boards that moved have long tails: setting any
-# part of them aside improves the fit of the rest. Each channel of rles01 and rles02 alone scatters 3 to 11
-# times as usual and seems to have moved, both together 2.5 times.
-_MOVING = 3.0
+# Noise of images, in usual levels, from which a change of the mounting counts less, by its square. Errors of
+# boards that moved have long tails: setting any part of them aside improves the fit of the rest. Each channel
+# of rles01 and rles02 alone scatters 3 to 11 times as usual and seems to have moved.
+_TAILED = 2.0
 _FEWEST_IN_GROUPS, _FEWEST_AT_END, _FEWEST_OF_GROUP = 8, 2, 3
 _MOST, _N_REJECTED = 4, 3
 _N_STARTS, _N_ROUNDS, _N_DIVISIONS = 24, 10, 4
@@ -116,7 +116,8 @@ class Explanation:
         cause: the cause's kind.
         weights: (F,) w of (1).
         n_tried: number of explanations of this kind.
-        cut: index of the first capture after a move ("moved"), or of another board ("two_boards").
+        cut: index of the first capture after a move ("moved"), of another board ("two_boards"), or of the
+            only one ("alone").
     """
 
     cause: Cause
@@ -224,8 +225,8 @@ class Poses(NamedTuple):
         yield from self.moves()
         F = len(self.gradient)
         order = np.arange(F)
-        for k in order:
-            yield Explanation("alone", (order == k).astype(np.float64), F)
+        for k in range(F):
+            yield Explanation("alone", (order == k).astype(np.float64), F, k)
         if F >= _FEWEST_IN_GROUPS and np.count_nonzero(np.diff(members := self.divide())) > 1:
             yield Explanation("groups", members, 2.0 ** (F - 1))
         yield Explanation("drift", order / max(F - 1, 1) - 0.5)
@@ -329,8 +330,10 @@ class Table:
         return sorted(found, key=lambda each: each.log10_chance)[:_N_REJECTED]
 
     def moves_beside(self, row: Gain) -> list[Gain]:
-        """List the moves one capture before and after another one."""
-        cuts = {row.explanation.cut - 1, row.explanation.cut + 1}
+        """List the moves one capture before and after another one, or at the end at which one disagrees."""
+        cut, F = row.explanation.cut, len(self.cost.gradients)
+        of_ends = {0: 2, 1: 2, F - 2: F - 2, F - 1: F - 2}
+        cuts = {of_ends.get(cut)} if row.cause == "alone" else {cut - 1, cut + 1}
         return [self.poses.gain(each) for each in self.poses.moves() if each.cut in cuts]
 
     def _candidates(self) -> Iterator[Explanation]:
@@ -427,15 +430,16 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         noisy = hypothesis.with_fitted_noise
         tried = [*Table(noisy, left).rows()[:1], rows[0], *late]
         # Causes that are similar at usual noise: after refitting, one may be much more probable than the
-        # other.
-        alike: Sequence[Cause] = next((k for k in _ALIKE if rows[0].cause in k), ())
-        tried += [r for r in rows if r.cause in alike and r.log10_chance < _LIKELY * rows[0].log10_chance]
+        # other. A constant error that is there in addition does not hide a change.
+        for alike in _ALIKE:
+            likely = [row for row in rows if row.cause in alike and row.log10_chance < _TRIED]
+            tried += [row for row in likely if row.log10_chance < _LIKELY * likely[0].log10_chance]
         if rows[0].cause not in _UNSETTLED:
             tried = [row for row in tried if row.cause not in _UNSETTLED]
-        tried += [near for row in tried if row.cause == "moved" for near in table.moves_beside(row)]
+        beside = [row for row in tried if row.cause in ("moved", "alone") and "moved" in left]
+        tried += [near for row in beside for near in table.moves_beside(row)]
         once = {(row.cause, row.explanation.cut): row for row in tried}
-        found = [_assume(hypothesis, noisy, row) for row in once.values()]
-        best = min(found, key=_rank)
+        best = min((_assume(hypothesis, noisy, row) for row in once.values()), key=_rank)
         # Far from the optimum (2) overstates the gain of many unknowns: of 5 captures with ranges 0.1 m too
         # long, the lens has -41, ranges -34, settled -6 and -18.
         constant = rows if rows[0].cause in CONSTANT else []
@@ -464,8 +468,7 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
         change = difference(after.T_in_use, now.T_in_use)
     elif row.cause in _UNSETTLED:
         # The likelihood has no such unknown: use its expansion and the noise of single captures.
-        unit = Table(now, frozenset()).unit_without(row)
-        chance = row.log10_chance / unit if unit < _MOVING**2 else 0.0
+        chance = row.log10_chance / Table(now, frozenset()).unit_without(row)
         change = row.value
         if row.cause in _OF_CAMERA:
             # Boards are farther or nearer by the same factor.
@@ -477,10 +480,12 @@ def _assume(now: Hypothesis, noisy: Hypothesis, row: Gain) -> Selected:
         weights = divided.astype(np.float64)
         row = row._replace(explanation=replace(row.explanation, weights=weights))
     left = after.with_fitted_noise
+    noise, most = left.levels.largest_of_images, max(SCATTER, noisy.levels.largest_of_images)
     fall = noisy.deviance - left.with_noise_up_to(SCATTER).deviance
+    if row.cause in MOUNTINGS:
+        fall /= max(noise / _TAILED, 1.0) ** 2
     chance = log10_chance(fall, row.freedoms) + np.log10(row.explanation.n_tried)
-    most = _MOVING if row.cause in MOUNTINGS else max(SCATTER, noisy.levels.largest_of_images)
-    if left.levels.largest_of_images > most or left.levels.of_ranges > SCATTER or not np.isfinite(fall):
+    if noise > most or left.levels.of_ranges > SCATTER or not np.isfinite(fall):
         chance = 0.0
     members = row.explanation.weights > 0
     # Most captures of a group fit its mounting; those with individual errors do not.
@@ -501,7 +506,10 @@ def _split(now: Hypothesis, row: Gain) -> tuple[Hypothesis, Array, NDArray[np.bo
     """
     members = row.explanation.weights > 0
     own, new = int(np.bincount(now.mounting[members]).argmax()), int(now.mounting.max()) + 1
-    T = np.append(now.state.T_cam_lidar, perturb(now.state.T_cam_lidar[own], row.value)[None], axis=0)
+    T = np.append(now.state.T_cam_lidar, now.mounting_of(members)[None], axis=0)
+    others = ~members & (now.mounting == own)
+    if others.any():
+        T[own] = now.mounting_of(others)
     for _ in range(_N_DIVISIONS):
         kept, mounting = np.unique(np.where(members, new, now.mounting), return_inverse=True)
         after = now.under(mounting=mounting, T_cam_lidar=T[kept])

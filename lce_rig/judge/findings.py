@@ -12,16 +12,22 @@ Verdict = Literal["pass", "marginal", "fail"]
 # Probability below which sessions that agree are reported to differ more than predicted.
 _UNLIKELY = 0.05
 _ANY = ""
-_FOLLOWS: Mapping[str, Collection[str]] = {
-    _ANY: (
+_OF_CAPTURES = frozenset(
+    (
         "verdict.plane_residual",
         "verdict.edge_residual",
         "verdict.planes_apart",
         "verdict.sensors_disagree",
+        "verdict.few_used",
+    )
+)
+"""Symptoms in the captures, also of errors that hardly displace the extrinsics."""
+_FOLLOWS: Mapping[str, Collection[str]] = {
+    _ANY: (
+        *_OF_CAPTURES,
         "verdict.channels_differ",
         "verdict.cameras_differ",
         "verdict.far_from_nominal",
-        "verdict.few_used",
         "verdict.scene",
     ),
     "association.mirrored": ("verdict.intrinsics",),
@@ -124,8 +130,8 @@ def arrange(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 
 def is_symptom_alone(findings: Sequence[Finding]) -> bool:
-    """Check whether all reasons are symptoms without a cause."""
-    follow = _SYMPTOMS | (PLATES if any(f.code in OF_SIZES for f in findings) else frozenset())
+    """Check whether all reasons are symptoms of errors that hardly displace the extrinsics."""
+    follow = _OF_CAPTURES | (PLATES if any(f.code in OF_SIZES for f in findings) else frozenset())
     codes = [f.code for f in findings if f.severity != "note" and f.code not in _UNCERTAIN]
     return bool(codes) and all(code in follow for code in codes)
 

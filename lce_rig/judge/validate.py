@@ -33,7 +33,7 @@ class Validation:
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: the parts of `cov`, the largest first.
         causes: errors that explain the captures better than noise, the reason first.
-        is_explained: whether they leave no more than about the usual noise.
+        is_explained: whether the planes of both sensors differ no more with them.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
         lens_model: finding of a lens model in the profile that does not fit the corners.
         hypothesis: the likelihood of all captures; None if they are too few to test.

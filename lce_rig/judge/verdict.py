@@ -20,6 +20,7 @@ from lce_rig.core.geometry import (
 )
 from lce_rig.core.results import BoardSurface, LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
+from lce_rig.judge.causes import MAX_PLANE_MISFIT_M
 from lce_rig.judge.contributions import largest, measure_action
 from lce_rig.judge.findings import (
     CHANNELS_DIFFER,
@@ -68,9 +69,6 @@ _LACKING, _DROPPED = 0.3, 0.04
 _SURE, _LATE_S = 3.0, 0.1
 # Rotation between channels of one camera that an image rotated by 180 deg explains, deg.
 _TURNED_DEG = 170.0
-MAX_PLANE_MISFIT_M = 0.012
-"""Limit of the rms difference between both sensors' planes: still boards stay below 8 mm, hand-held ones
-reach 20 to 30 mm."""
 # Least chi-squared, of six degrees of freedom, of a scene that fails a result: a chance of 6e-7, as of 5
 # standard deviations of one quantity. A smaller contradiction is a warning.
 SCENE_FAILS_CHI2 = 39.5

@@ -21,7 +21,7 @@ from lce_rig.calibrate.likelihood.fit import (
     stack_captures,
     weigh_placements,
 )
-from lce_rig.calibrate.likelihood.images import StackedImages
+from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
 from lce_rig.calibrate.likelihood.layout import Layout, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, OF_IMAGES, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, linearise
@@ -85,6 +85,13 @@ class Hypothesis:
         moves = extrinsics_by_unknowns(self.terms) @ self.state.z
         return perturb(self.state.T_cam_lidar[most], moves[most])
 
+    @property
+    def planes_apart_m(self) -> float:
+        """Rms distance of the boards' centres in images from their planes in scans."""
+        rows = np.concatenate([each[:, :3, -1] for each in self.terms.image_rows])
+        normals = np.concatenate([each.T_cam_board[:, :3, 2] for each in self.terms.images])
+        return float(np.sqrt(np.mean(np.einsum("pi,pi->p", rows, normals) ** 2)))
+
     @cached_property
     def deviance(self) -> float:
         """-2 ln p(captures, levels of the images) at the optimum, up to a constant."""
@@ -103,6 +110,24 @@ class Hypothesis:
         usual = self.levels.with_usual_images
         most = {name: min(getattr(self.levels, name), ratio * getattr(usual, name)) for name in OF_IMAGES}
         return replace(self, levels=replace(self.levels, **most))
+
+    def mounting_of(self, members: NDArray[np.bool_]) -> Array:
+        """Find the extrinsics (4, 4) that bring the boards of scans closest to those of images.
+
+        Args:
+            members: (F,) captures.
+        """
+        images = self.images.select(members[self.images.capture])
+        errors = self.state.z[self.state.layout.errors(0)]
+        most = int(np.bincount(self.mounting[members]).argmax())
+        T, weights = self.state.T_cam_lidar[most], np.linalg.inv(images.total_cov(self.levels))
+        for _ in range(_OWN_STEPS):
+            rows = image_rows(images, T, self.T_lidar_board, errors)
+            by_camera, residual = rows[:, :, :6], rows[:, :, -1]
+            H = np.einsum("pia,pij,pjb->ab", by_camera, weights, by_camera)
+            g = np.einsum("pia,pij,pj->a", by_camera, weights, residual)
+            T = perturb(T, -np.linalg.solve(H, g))
+        return np.asarray(T)
 
     def under(
         self,
@@ -128,15 +153,11 @@ class Hypothesis:
             n_optics = [each.turns.shape[1] for each in (self.images, *of_base)]
             base = len(split) if of_base else None
             layout = Layout(n_optics, old.layout.n_rings, lens_of, base)
-            z = old.common_to(layout, terms.scans.rings, terms.scans.rings)
-            for new, before in ((0, 0), (-1, old.layout.n_cameras - 1)):
-                z[layout.optics(new)] = old.z[old.layout.optics(before)]
             T_cam_lidar = np.array([*T_cam_lidar, *([np.eye(4)] if of_base else [])])
             split += of_base
-            # A wrong mounting has displaced boards from their positions in the scans.
-            is_new = (mounting != self.mounting)[:, None, None]
-            T_lidar_board = np.where(is_new, self.T_lidar_board, old.T_lidar_board)
-            state = State(layout, T_cam_lidar, T_lidar_board, old.own_shift_m, z)
+            # A wrong mounting has displaced boards from their positions in the scans, and constant errors.
+            own_shift_m, z = np.zeros(len(mounting)), np.zeros(layout.z.size)
+            state = State(layout, T_cam_lidar, self.T_lidar_board, own_shift_m, z)
             terms = linearise(terms.scans, split, terms.board, state, terms.trust)
             terms = approach(terms, self.levels, priors)
         terms = settle(terms, self.levels, priors, _STEPS, _SHORT)
