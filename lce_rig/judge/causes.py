@@ -141,9 +141,10 @@ def _displacement(cause: Selected, reason: Finding) -> Sensitivity:
     return Sensitivity(reason.code.removeprefix("verdict."), 1.0, share * cause.change[None])
 
 
-def is_explained(selected: Sequence[Selected]) -> bool:
-    """Check whether the causes leave the planes of both sensors together, so that symptoms follow from them."""
-    return bool(selected) and selected[-1].after.planes_apart_m <= MAX_PLANE_MISFIT_M
+def is_explained(selected: Sequence[Selected], estimate: CalibrationEstimate) -> bool:
+    """Check whether the causes bring the planes of both sensors together, so that symptoms follow from them."""
+    most_m = max(estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M) / 2
+    return bool(selected) and selected[-1].after.planes_apart_m <= most_m
 
 
 def _is_over(selected: Selected, used: Sequence[str]) -> bool:

@@ -33,7 +33,7 @@ class Validation:
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: the parts of `cov`, the largest first.
         causes: errors that explain the captures better than noise, the reason first.
-        is_explained: whether the planes of both sensors differ no more with them.
+        is_explained: whether they bring the planes of both sensors together.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
         lens_model: finding of a lens model in the profile that does not fit the corners.
         hypothesis: the likelihood of all captures; None if they are too few to test.
@@ -83,7 +83,7 @@ def validate(
         cov_shared=summed_covariance([each for each in known if each.source in OF_BOARD]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
         causes=causes,
-        is_explained=is_explained(selected),
+        is_explained=is_explained(selected, estimate),
         intrinsics=intrinsics,
         lens_model=[] if fitted is None or lens is None else model_findings(fitted, board),
         hypothesis=hypothesis,
