@@ -16,10 +16,8 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 _STEP_M = 0.6  # Length of a person's step to the side.
 _ROTATIONS = ("tilt", "turn", "roll")
-#: Differences, m and deg, below which no instruction is given: people cannot correct smaller ones.
-DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
-#: Tolerance of every pose figure at the target, in dead bands.
-THERE = 1.5
+# Differences below which no instruction is given: people cannot correct smaller ones.
+_DEAD_M, _DEAD_DEG = 0.15, 10.0
 
 
 @dataclass(frozen=True)
@@ -91,10 +89,10 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str
         wanted: (4, 4) T_cam_board to reach.
     """
     changes = _changes(view, present, wanted)
-    # Dead bands make ways and angles comparable.
-    sizes = {kind: abs(amount) / DEAD_BANDS[kind] for kind, amount in changes.items()}
+    limits = dict.fromkeys(changes, _DEAD_M) | dict.fromkeys(_ROTATIONS, _DEAD_DEG)
     ordered = sorted(
-        (kind for kind in sizes if sizes[kind] > 1), key=lambda kind: (kind in _ROTATIONS, -sizes[kind])
+        (kind for kind, amount in changes.items() if abs(amount) > limits[kind]),
+        key=lambda kind: (kind in _ROTATIONS, -abs(changes[kind])),
     )
     return {kind: _in_words(kind, changes[kind]) for kind in ordered}
 
@@ -106,8 +104,7 @@ def say(instructions: Mapping[Kind, str]) -> str:
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
     """Check whether a board (4, 4) is as close to its target pose (4, 4) as people can hold it."""
-    changes = _changes(view, present, wanted)
-    return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
+    return not instruct(view, present, wanted)
 
 
 def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, float]:
