@@ -43,7 +43,7 @@ ORANGE: Colour = (60, 160, 255)
 RED: Colour = (40, 40, 200)
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-# Letters in a line of text under an image, of mean width.
+# Longest line of text under an image, letters.
 _N_LETTERS = 110
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
 # Images have large uniform areas and thin marks: run-length encoding compresses them as well as a search, in
@@ -150,13 +150,14 @@ def draw_line(
 def with_note(picture: Picture, text: str, colour: Colour) -> Picture:
     """Add white text on a coloured band below an image."""
     lines = textwrap.wrap(text, _N_LETTERS)
-    (text_px, letter_px), _ = cv2.getTextSize(text, _FONT, 1, 1)
-    scale = picture.shape[1] * len(text) / (_N_LETTERS * text_px)
+    # Most letters are narrower than this one.
+    (line_width_px, letter_px), _ = cv2.getTextSize("n" * _N_LETTERS, _FONT, 1, 1)
+    scale = picture.shape[1] / line_width_px
     line_px = 2 * scale * letter_px
     band = np.empty((round((len(lines) + 0.5) * line_px), *picture.shape[1:]), dtype=np.uint8)
     band[:] = colour
     for k, line in enumerate(lines, start=1):
-        at, width_px = (round(0.5 * line_px), round(k * line_px)), max(1, round(line_px / 18))
+        at, width_px = (round(0.5 * line_px), round(k * line_px)), max(1, round(line_px / 24))
         cv2.putText(band, line, at, _FONT, scale, WHITE, width_px, cv2.LINE_AA)
     return np.concatenate([picture, band])
 
