@@ -35,8 +35,8 @@ _LEVEL_ROUNDS = (8, 4, 8)
 # First blurs of ring ends, rad. Until the edge shift is known, all ends may lie outside their intervals,
 # where a sharp density is flat.
 BLURS_RAD = (4e-3, 1.5e-3)
-# Levels lie within these factors of the typical value, e^-4.6 and e^3.
-_BELOW, _ABOVE = -4.6, 3.0
+# Levels lie within a factor of a hundred of the typical value.
+_LOG_FACTOR = 4.6
 # Largest influence of a placement, in standard deviations: its weight stays above 0.
 _FARTHEST = 1e6
 # Number of plain steps before Anderson mixing, and of steps that it combines.
@@ -386,8 +386,8 @@ def fit_levels(
         off = (x / scale - middle) / sigma
         return value + float(off @ off), (slopes + 2 * off / sigma) / scale
 
-    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
-    bounds = list(zip((middle + _BELOW) * scale, highest * scale, strict=True))
+    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _LOG_FACTOR)
+    bounds = list(zip((middle - _LOG_FACTOR) * scale, highest * scale, strict=True))
     options = {"maxiter": n_rounds, "ftol": 1e-6}
     first = np.log([getattr(start, name) for name in names]) * scale
     best = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
