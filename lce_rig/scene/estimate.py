@@ -21,6 +21,7 @@ REACH = np.repeat([0.2, np.radians(2.0)], 3)
 """Region searched about the start by default, m and rad."""
 
 _UNITS = REACH / 4  # Steps of like effect, for the search.
+_STEPS = _UNITS / 10  # of numerical differences
 # Random starts at each width of the fields, coarse to fine, and maxima kept from it.
 _N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
 _SEARCH_EDGES = 3000  # on all but the finest fields
@@ -42,7 +43,6 @@ _NEAR_SIGMAS = 2.0  # Displacement of extrinsics within their errors, along each
 _NOTICED = 27.04
 _CONTROL_SIGMAS = 3.0  # Displacement after which extrinsics must score less.
 _UNDETERMINED = 0.5  # Standard deviation of an undetermined direction, in reaches.
-_LENS_STEP_RAD = 1e-3  # Displacement in the image, by focal length, of a difference by the intrinsics
 _FOCAL_STEP = 0.01  # Smallest relative change of the focal lengths that is compared.
 
 
@@ -278,7 +278,7 @@ def _covariance(score: OutlineScore, tangent: Array, reach: Array) -> Array:
 def _inverse_curvature(score: OutlineScore, tangent: Array) -> Array:
     """Invert the curvature (6, 6) of the score at a maximum; flat directions count as slightly curved."""
     curvature = np.empty((6, 6))
-    for axis, step in enumerate(_UNITS / 10):
+    for axis, step in enumerate(_STEPS):
         either = [score.score(tangent + sign * step * np.eye(6)[axis])[1] for sign in (1, -1)]
         curvature[axis] = -(either[0] - either[1]) / (2 * step)
     scale = np.outer(_UNITS, _UNITS)
@@ -307,7 +307,7 @@ def follow_lens(
     _, _, by_lens = model.project(vector, grid_rays(intrinsics)[1])
     largest_px = np.abs(by_lens @ changes).max(axis=(0, 1))
     motions = []
-    for change, step in zip(changes.T, _LENS_STEP_RAD * intrinsics.fx_px / largest_px, strict=True):
+    for change, step in zip(changes.T, _STEPS[-1] * intrinsics.fx_px / largest_px, strict=True):
         lenses = [model.intrinsics(vector + sign * step * change, *size_px) for sign in (1, -1)]
         either = [OutlineScore.finest(views, lens, T_cam_lidar).score(np.zeros(6))[1] for lens in lenses]
         motions.append(inverse @ (either[0] - either[1]) / (2 * step))

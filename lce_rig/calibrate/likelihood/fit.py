@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import EXACT, LOG_SIGMA, MOST_LOST, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, no_scans, stack_scans
 from lce_rig.calibrate.observations import group_poses
@@ -25,6 +25,7 @@ from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import HUBER, Array, invert, perturb
 from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
+from lce_rig.lens.models import EXACT
 
 # Maximum number of steps between two fits of the levels, and after the last one.
 STEPS, _LAST_STEPS = 3, 20

@@ -39,8 +39,6 @@ from lce_rig.core.results import Observation
 
 MIN_MOVING = 6
 """Fewer captures with images of several times do not determine time offsets."""
-# Ratio of mean squared rates to noise above which boards moved.
-_MOVED = 1.0
 # Prior standard deviation of time offsets, s, of images without timestamps or tolerance, which may have been
 # taken at any time around the scan.
 _UNKNOWN_SIGMA_S = 0.15
@@ -136,7 +134,8 @@ def estimate_motion(
     cov = inverse @ (few * gradients.T @ gradients + cost.precision) @ inverse
     # Uninformative captures scatter little, so the variance is at least that from the curvature of (1).
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
-    if fit_motions(samples, offset_s).significance <= _MOVED:
+    # Noise alone gives 1.
+    if fit_motions(samples, offset_s).significance <= 1:
         return still
     return replace(still, offset_s=offset_s, cov=widen[:, None] * cov * widen, sensitivity=T_rates)
 
