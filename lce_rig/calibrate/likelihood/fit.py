@@ -44,8 +44,6 @@ _FARTHEST = 1e6
 _PLAIN, _MIXED = 3, 5
 # Errors of lens and board that `Priors.held` fixes.
 _HELD = ("pattern_offset", "intrinsics")
-# Squared length of a step that counts as diverged, in standard deviations.
-_DIVERGED = 1e12
 # Largest ratio of a mixed step's length to the plain one's.
 _LONGEST = 5.0
 
@@ -327,7 +325,7 @@ def descend(
     for _ in range(n_steps):
         reduced = reduce(terms)
         # Far from any optimum steps may diverge: keep the last finite terms.
-        if not reduced.decrement < _DIVERGED:
+        if not np.isfinite(reduced.decrement):
             return finite
         finite = terms
         if reduced.decrement < short**2:
