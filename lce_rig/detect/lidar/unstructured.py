@@ -67,8 +67,8 @@ _FOOT_M = 0.15
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
 # Growth of the outline above which it is that of another plate.
 _MOST_GROWTH_M = 0.04
-# Cells of the plate for means of returns.
-_COARSE_M, _FINE_M, _MIN_CELL_RETURNS = 0.25, 0.10, 3
+# Cells of the plate for means of returns; their noise is never taken as less than this.
+_COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
 # Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
@@ -545,4 +545,4 @@ def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
         freedom = max(len(height) - 3, 1)
         sigmas.append((len(height), float(np.sqrt(height @ height / freedom))))
     (n_coarse, coarse_m), (n_fine, fine_m) = sigmas
-    return means, max(coarse_m * np.sqrt(n_fine / max(n_coarse, 1)), fine_m)
+    return means, max(coarse_m * np.sqrt(n_fine / max(n_coarse, 1)), fine_m, _LEAST_MEAN_M)
