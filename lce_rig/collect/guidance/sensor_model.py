@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.likelihood.levels import EXACT, Levels, Priors, what_is_known
+from lce_rig.calibrate.likelihood.levels import Levels, Priors, what_is_known
 from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, KnownLidar, Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -13,6 +13,7 @@ from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import EVEN_STEPS, Array, exp_so3, invert, pose
 from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
+from lce_rig.lens.models import EXACT
 from lce_rig.rig import QualitySettings, Rig
 
 
