@@ -30,6 +30,7 @@ NORMAL_TOLERANCE_RAD = np.radians(12.0)
 CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
 _N_REFINEMENTS = 10
+_MOVED_M = 0.1
 # Above this, the image alone excludes the second pose, whatever the error of the camera model.
 _MAX_CHI2_GAP = 100.0
 
@@ -112,7 +113,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
                 candidate=int(pairs.candidate[nearest]),
                 distance_m=float(distance[nearest]),
                 rotation_deg=float(np.degrees(angle[nearest])),
-                action="hold_still" if distance[nearest] > CENTRE_TOLERANCE_M else "",
+                action="hold_still" if distance[nearest] > _MOVED_M else "",
             )
     return Consensus(pose(R_best, t_best), tuple(observations), refused)
 

@@ -27,9 +27,9 @@ from lce_rig.simulate import SimulationOptions, rig_truth
 if TYPE_CHECKING:
     from lce_rig.show.phone.preview import Preview
 
-#: An unattended run ends after this time without a capture: a person at a rig without a terminal may be away
-#: for a while.
-UNATTENDED_IDLE_S = 1800.0
+#: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
+#: rig without a terminal may be away for a while.
+SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 600.0, 1800.0
 _ENDINGS = {
     "enough": "the target is predicted to be met",
     "frames": "the number of captures is reached",
@@ -73,7 +73,7 @@ def run_live(
             write_truth(path / TRUTH, rig_truth(rig, seed or 0, SimulationOptions.for_rig(rig.name)))
         sources = open_live(rig) if person is None else person.sources
         asked = stack.enter_context(controls())
-        idle_s = None if asked.is_interactive and not simulated else UNATTENDED_IDLE_S
+        idle_s = SIMULATED_IDLE_S if simulated else None if asked.is_interactive else UNATTENDED_IDLE_S
         hold_s = HOLD_S if hold is None else hold
         options = LiveOptions(n_wanted, timeout, hold_s, goes_on=keep_going, idle_s=idle_s)
         with open_view(

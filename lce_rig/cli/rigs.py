@@ -206,9 +206,8 @@ def _board_settings(parent: Rig, board: str) -> list[tuple[str, str]]:
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
 _PLATE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)x(\d+(?:\.\d*)?|\.\d+)")
-# Height of a line on the page; space around the plate, and below it for the profile block and instructions.
-_LINE_MM = 5.0
-_MARGIN_MM, _TEXT_MM = 3 * _LINE_MM, 15 * _LINE_MM
+# Space around the plate on the page, for the profile block and mounting instructions below it, mm.
+_MARGIN_MM, _TEXT_MM, _LINE_MM = 15.0, 75.0, 5.0
 _MM_PER_INCH = 25.4
 _MOUNTING = (
     "Print at 100 %, matt. Glue it flat onto a stiff plate (aluminium composite, 3 to 6 mm) of this size.",

@@ -45,10 +45,11 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
             caller.shutdown(wait=False, cancel_futures=True)
 
 
-# Minimum interval between slow searches, which delay the guidance, s: thorough ones of an image without a
-# board, and of a whole scan while all candidates are tracked.
-_SLOW_SEARCH_S = 3.0
-# The same in units of the longest recent time per frame; decay of that time per frame.
+# Minimum interval between thorough searches of an image without a board, s; they delay the guidance.
+_THOROUGH_S = 3.0
+# Minimum interval between searches of a whole scan while all candidates are tracked, s.
+_RESCAN_S = 1.0
+# Minimum interval of both in units of the longest recent time per frame; decay of that time per frame.
 _RARE, _FORGET = 6.0, 0.95
 
 
@@ -57,7 +58,7 @@ class BoardSearch(Worker):
 
     def __init__(self, rig: Rig) -> None:
         """Prepare; see `BoardTracker`."""
-        super().__init__("search for the board", _Search, rig, _SLOW_SEARCH_S, _SLOW_SEARCH_S)
+        super().__init__("search for the board", _Search, rig, _THOROUGH_S, _RESCAN_S)
 
     def sight(self, frame: Frame) -> BoardDetection:
         """Find the board in every image and scan of a frame.
@@ -95,8 +96,8 @@ class _Search:
         # On a busy computer a thorough search may take longer than the interval to the next one. Keep such
         # searches rare, so that not every frame waits for one.
         self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
-        interval_s = max(_SLOW_SEARCH_S, _RARE * self._longest_s)
-        self._tracker.thorough_interval_s = self._tracker.rescan_interval_s = interval_s
+        self._tracker.thorough_interval_s = max(_THOROUGH_S, _RARE * self._longest_s)
+        self._tracker.rescan_interval_s = max(_RESCAN_S, _RARE * self._longest_s)
         return _without_samples(detection)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:

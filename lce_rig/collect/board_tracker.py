@@ -22,6 +22,10 @@ ImageKey = tuple[str, str]
 
 # Interval between full searches, s: of images without a board, and of scans whose candidate was lost.
 _SEARCH_S = 0.3
+# Factor on the tolerance of the nominal extrinsics within which a candidate counts as the camera's board.
+_NOMINAL_MARGIN = 1.5
+# Largest misfit, relative to its limit, that confirms nominal extrinsics for boards at all distances.
+_PROVED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +212,7 @@ class BoardTracker:
                 if nominal is None:
                     return None
                 misfit, elsewhere = _compare(board, candidates, nominal)
-                if misfit <= 1:
+                if misfit <= _PROVED:
                     self._are_proved.add((camera, lidar))
                 if misfit <= 1 or (camera, lidar) not in self._are_proved:
                     return None
@@ -255,9 +259,9 @@ def _compare(
     # The distance of the boards' centres, and the angle of their planes.
     distance = np.linalg.norm(expected[:, :3, 3] - measured[:, :3, 3], axis=1)
     angle = np.arccos(np.minimum(np.abs(np.sum(expected[:, :3, 2] * measured[:, :3, 2], axis=1)), 1.0))
-    turn_rad = np.radians(nominal.tolerance_deg)
+    turn_rad = _NOMINAL_MARGIN * np.radians(nominal.tolerance_deg)
     range_m = float(np.linalg.norm(board.T_cam_board[:3, 3]))
-    max_m = CENTRE_TOLERANCE_M + nominal.tolerance_m + range_m * turn_rad
+    max_m = CENTRE_TOLERANCE_M + _NOMINAL_MARGIN * nominal.tolerance_m + range_m * turn_rad
     misfit = np.maximum(distance / max_m, angle / (NORMAL_TOLERANCE_RAD + turn_rad))
     best = int(np.argmin(misfit))
     figures = {

@@ -22,11 +22,18 @@ _LEAST_NS, _MOST_NS = 30_000_000, 250_000_000
 _STEP_NS, _MOST_LAG_NS = 50_000_000, 500_000_000
 _LAGS_NS = tuple(range(-_MOST_LAG_NS, _MOST_LAG_NS + 1, _STEP_NS))
 _WAIT_NS = 400_000_000
+# Fraction of pixels with events between two images above which the scene counts as moving.
+_MOVING = 0.01
 # Maximum number of compared image pairs, and minimum for a finding.
 _MOST_PAIRS, _LEAST_PAIRS = 60, 8
 # Correlation that establishes a rotation, sign and offset, and its minimum ratio to that of another rotation
 # or sign. Simulated DAVIS346 reach 0.4 to 0.7; neighbouring lobes a quarter of it.
-_AGREES, _EXCEEDS = 0.3, 2.0
+_AGREES, _EXCEEDS = 0.1, 2.0
+_SIGNED = 0.3
+# Offset between events and frames above which it is reported, s; `calibrate` estimates smaller ones.
+_LATE_S = 0.1
+# Darkest grey value compared; it bounds the noise of the logarithm.
+_DARKEST = 4.0
 # Steps through the rows and columns of an image that undo each rotation of the events.
 _TURNS = {
     "": (1, 1),
@@ -76,14 +83,13 @@ class EventsCheck:
             score = np.nan_to_num(scores).mean(axis=0)[:, 0]
             best = int(np.argmax(np.abs(score)))
             others = score[np.sign(score) != np.sign(score[best])]
-            if abs(score[best]) < _AGREES or abs(score[best]) < _EXCEEDS * np.abs(others).max(initial=0):
+            if abs(score[best]) < _SIGNED or abs(score[best]) < _EXCEEDS * np.abs(others).max(initial=0):
                 continue
             channel = event_channel(self._rig, camera) or ""
             if score[best] < 0:
                 found.append(EVENTS_POLARITY(f"{camera}.{channel}", correlation=float(score[best])))
-            # `calibrate` estimates smaller offsets.
-            if abs(_LAGS_NS[best]) > _STEP_NS:
-                late_s = round(1e-9 * _LAGS_NS[best], 3)
+            late_s = round(1e-9 * _LAGS_NS[best], 3)
+            if abs(late_s) >= _LATE_S:
                 own = self._rig.cameras[camera].channels[channel].timestamps.expected_offset_s
                 figures = {"late_s": late_s, "expected_offset_s": round(own - late_s, 3)}
                 found.append(EVENTS_LATE(f"{camera}.{channel}", camera=camera, channel=channel, **figures))
@@ -95,7 +101,7 @@ class EventsCheck:
         if time_ns is None:
             return
         grey = image.pixels if image.pixels.ndim == 2 else image.pixels.mean(axis=2)
-        light = np.log1p(grey)
+        light = np.log(np.maximum(grey, _DARKEST, dtype=np.float64))
         last = self._last.get(image.sensor)
         self._last[image.sensor] = time_ns, light
         if last is not None and _LEAST_NS <= time_ns - last[0] <= _MOST_NS and last[1].shape == light.shape:
@@ -154,6 +160,6 @@ def _sum(packets: tuple[Events, ...], start_ns: int, end_ns: int, size: tuple[in
 def _correlation(one: Array, other: Array) -> float:
     """Correlate two maps (H, W); NaN without motion."""
     spread = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))
-    if spread == 0:
+    if spread == 0 or np.count_nonzero(other) < _MOVING * other.size:
         return math.nan
     return float(np.mean(one * other)) / spread

@@ -32,10 +32,12 @@ from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 
 # Minimum and scarce free space, MB: a capture is a few MB; raw 1280x720 px images at 30 Hz are 55 MB/s.
-_MIN_FREE_MB, _MIN_WRITE_MBPS = 500.0, 2.0
-_SCARCE = 10  # times the minimum
+_MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
+_MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
 # struct timex is 26 longs on 64-bit Linux; its fourth is the largest error, us.
 _TIMEX_LONGS, _MAX_ERROR_LONG, _TIME_ERROR = 32, 3, 5
+# Largest relative error of the rate of the sync board's pulses.
+_MAX_OFF_PULSES = 0.02
 _STOPPED_S = 1.0
 # Tolerance on the counts of frames and pulses: both arrive in bursts.
 _ROOM = 2
@@ -61,9 +63,9 @@ def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
         yield findings.DISK_NOT_WRITABLE(folder=str(folder), cause=error.strerror)
         return
     yield findings.DISK(free_mb=free_mb, write_mbps=write_mbps, folder=str(folder))
-    if free_mb < _SCARCE * _MIN_FREE_MB:
+    if free_mb < _SCARCE_MB:
         yield findings.DISK_FULL(severity="error" if free_mb < _MIN_FREE_MB else "warning")
-    elif write_mbps < _SCARCE * _MIN_WRITE_MBPS:
+    elif write_mbps < _SLOW_WRITE_MBPS:
         yield findings.DISK_SLOW(severity="error" if write_mbps < _MIN_WRITE_MBPS else "warning")
 
 
@@ -203,7 +205,7 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
             n_lost = board.status.n_lost_by_line.get(line, 0)
             rate_hz = 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
         figures: dict[str, Any] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
-        if abs(rate_hz / expected_hz - 1) > MAX_OFF_RATE:
+        if abs(rate_hz / expected_hz - 1) > _MAX_OFF_PULSES:
             # The driver reports the missing pulse per second.
             severity: Severity = "warning" if rate_hz else "note" if line == PPS_LINE else "error"
             yield findings.LINE_OFF(**figures, severity=severity, action=action)

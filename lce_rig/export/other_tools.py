@@ -241,7 +241,7 @@ KIT, BASE = "sensor_kit_base_link", "base_link"
 KIT_FILE, BASE_FILE = "sensor_kit_calibration.yaml", "sensors_calibration.yaml"
 _POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 # Height of the points' origin above the base of the housing in the LiDAR's description, m.
-_CENTRE_M = dict.fromkeys(("VLP-16", "VLP16"), 0.0377)
+_CENTRE_M = {"VLP-16": 0.0377, "VLP16": 0.0377}
 
 
 class _Entry(NamedTuple):

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.bounds import MAX_BYTES
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import SessionError, SourceError, reading
-from lce_rig.core.geometry import ROUNDING, pose
+from lce_rig.core.geometry import pose
 from lce_rig.export import ExportJob
 from lce_rig.export.robot_tree import Joint, JointChange, RobotTree, fit_tree
 from lce_rig.export.writing import number, rpy
@@ -26,6 +26,8 @@ from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+# Tolerance of a quaternion's norm, far above the rounding of ROS's float64; more is not a rotation.
+_UNIT_TOLERANCE = 1e-3
 _ORIGIN = re.compile(rb"""<origin\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
@@ -106,7 +108,7 @@ def read_robot_bag(path: Path) -> RobotTree:
             frames = stamped.header.frame_id.removeprefix("/"), stamped.child_frame_id.removeprefix("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
             xyz, xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
-            if not (np.isfinite(xyz).all() and abs(np.linalg.norm(xyzw) - 1) < ROUNDING):
+            if not (np.isfinite(xyz).all() and abs(np.linalg.norm(xyzw) - 1) < _UNIT_TOLERANCE):
                 raise SessionError(f"{path}: the static transform to {frames[1]} is not rigid")
             joints.pop(frames, None)
             joints[frames] = Joint(*frames, pose(Rotation.from_quat(xyzw).as_matrix(), xyz))

@@ -31,6 +31,8 @@ _MAX_HALVES = 0.03
 # Smallest ratio of a ring's azimuth step to the model's that is named. It is 1.0 in 11 recordings; profiles
 # of a VLP-16 at 20 Hz and an Ouster with 512 columns may state 10 Hz and 1024. Rings show every second point.
 _SKIPPED_STEPS = 2.5
+# Smallest azimuth step, rad: smaller differences are returns of one firing.
+_MIN_STEP_RAD = 1e-4
 _MAX_NAMED = 3
 
 
@@ -119,10 +121,9 @@ def _compare_steps(scan: Scan, settings: LidarSettings) -> list[Finding]:
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
     order = np.lexsort((azimuth, scan.ring))
     turn = np.diff(azimuth[order])[np.diff(scan.ring[order]) == 0]
-    model_rad = sheet.step_rad(settings.rate_hz)
-    # Smaller differences are returns of one firing.
-    steps = turn[turn > model_rad / 2]
+    steps = turn[turn > _MIN_STEP_RAD]
     step_rad = float(np.median(steps)) if len(steps) else 0.0
+    model_rad = sheet.step_rad(settings.rate_hz)
     if step_rad < _SKIPPED_STEPS * model_rad:
         return []
     figures = {"step_deg": math.degrees(step_rad), "model_step_deg": math.degrees(model_rad)}

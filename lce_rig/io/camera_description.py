@@ -40,6 +40,8 @@ _COEFFICIENTS = (
 )
 _PROJECTION = ("projectionmatrix", "p")
 _RECTIFICATION = ("rectificationmatrix", "r")
+# Rotation by rectification that has no effect on a calibration, deg.
+_TURNED_DEG = 0.005
 _SIZE = ("imagesize", "resolution", "imgsize", "size")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "camwidth"), ("imageheight", "height", "camheight")
 _MODEL = ("distortionmodel", "distmodel", "cammodel", "cameramodel", "modeltype", "model", "lensmodel")
@@ -96,9 +98,10 @@ class CameraDescription:
         if is_rectified and self.P.any():
             K, distortion, model = self.P[:, :3], (), ""
             notes.append("its P without distortion, as the images are rectified")
-            turned_deg = round(self.turned_deg, 2)
-            if turned_deg:
-                notes.append(f"optical_frame is that of the rectified images, {turned_deg:g} deg away (R)")
+            if self.turned_deg > _TURNED_DEG:
+                notes.append(
+                    f"optical_frame is that of the rectified images, {self.turned_deg:.2g} deg away (R)"
+                )
         elif is_rectified and any(distortion):
             raise ValueError("P is all zero, and the images are rectified")
         lens = Intrinsics.from_ros(model, K, distortion, self.size_px)

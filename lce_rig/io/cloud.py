@@ -32,7 +32,7 @@ _NO_RINGS_HINT = (
     "For a LiDAR without rings (Livox, solid state), name the model in the profile, or set `model: "
     "unstructured`. For a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
 )
-NS_PER_UNIT = {unit: np.timedelta64(1, unit) / np.timedelta64(1, "ns") for unit in ("s", "ms", "us", "ns")}
+NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 
 def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:

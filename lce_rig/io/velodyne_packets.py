@@ -19,6 +19,8 @@ from lce_rig.timing.clock import resolve_hour
 # Neighbouring blocks of a real rotor at 600 rpm lie 0.38 to 0.42 deg apart.
 _MAX_UNEVEN_STEPS = 6
 _MAX_UNEVEN_SHARE = 0.15
+# 240 rpm to 1260 rpm; the sensor turns at 300 to 1200.
+_ROTOR_HZ = (4.0, 21.0)
 # Flag and azimuth of each block, then time, mode and product.
 _HEADS = struct.Struct("<" + "HH96x" * velodyne.N_BLOCKS + "IBB")
 _FLAGS = [velodyne.BLOCK_FLAG] * velodyne.N_BLOCKS
@@ -120,13 +122,13 @@ def read_data_packet(
         raise BadPacketError(f"of a {velodyne.PRODUCTS[product]}", velodyne.PRODUCTS[product])
     if product != wanted.code or mode not in velodyne.RETURN_MODES:
         raise BadPacketError("unknown factory bytes (firmware before 3.0.29 sends none)")
-    if not _is_even(azimuth, mode == velodyne.DUAL):
+    if not _is_even(azimuth, mode == velodyne.DUAL, wanted.block_ns):
         raise BadPacketError("uneven azimuths")
     fields = np.frombuffer(payload, velodyne.DATA_PACKET)[0]
     return DataPacket(host_ns, us, mode, wanted, np.array(azimuth, np.int64), fields)
 
 
-def _is_even(azimuth: Sequence[int], is_dual: bool) -> bool:
+def _is_even(azimuth: Sequence[int], is_dual: bool, block_ns: int) -> bool:
     """Check whether 12 blocks advance like those of a rotating rotor."""
     steps = [(b - a) % velodyne.AZIMUTH_STEPS for a, b in pairwise(azimuth)]
     if is_dual:
@@ -134,8 +136,11 @@ def _is_even(azimuth: Sequence[int], is_dual: bool) -> bool:
             return False
         steps = steps[1::2]
     middle = sorted(steps)[len(steps) // 2]
+    rotor_hz = middle / (velodyne.AZIMUTH_STEPS * block_ns * 1e-9)
+    if not _ROTOR_HZ[0] <= rotor_hz <= _ROTOR_HZ[1]:
+        return False
     most = max(_MAX_UNEVEN_STEPS, _MAX_UNEVEN_SHARE * middle)
-    return middle > 0 and max(middle - min(steps), max(steps) - middle) <= most
+    return max(middle - min(steps), max(steps) - middle) <= most
 
 
 def read_position_packet(payload: bytes | memoryview) -> PositionPacket:

@@ -18,7 +18,7 @@ from lce_rig.lens.models import LensModel, model_of
 
 USUAL_M = 10.0
 """Distance of the point whose uncertainty a summary states."""
-DISTANCES_M = (USUAL_M / 2, USUAL_M, 2 * USUAL_M)
+DISTANCES_M = (5.0, USUAL_M, 20.0)
 """Distances of the points whose uncertainty is reported: beyond the boards, where rotation errors grow."""
 CHANGED_CHI2 = 27.86
 """Least chi-squared of changed extrinsics: a chance of 1e-4, as of explanations."""

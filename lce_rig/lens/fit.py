@@ -20,7 +20,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, chance_of, perturb, skew
 from lce_rig.core.planar_pose import linearise_poses, mirror_tilt, refine_poses
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
-from lce_rig.lens.models import EXACT, LensModel, LensPrior
+from lce_rig.lens.models import LensModel, LensPrior
 
 # Prior deviations of boards from the nominal shape: bowed by millimetres, bent otherwise by less, printed
 # longer in one direction by a fraction, the pattern and single corners displaced by a tenth of a millimetre.
@@ -28,6 +28,8 @@ BOW_SIGMA_M = 0.003
 BEND_SIGMA_M = 0.001
 ASPECT_SIGMA = 0.002
 PRINT_SIGMA_M = 1e-4
+# A board stated as exact in the profile.
+_EXACT_M = 1e-7
 # Bow along width and height, aspect, five further bends, seven smooth displacements of the pattern; then the
 # corners' own offsets.
 N_MODES = 15
@@ -88,7 +90,7 @@ class Setup:
         information[coefficients, coefficients] = np.array(model.prior_sigma) ** -2
         if prior is not None:
             mean[:P], information[:P, :P] = prior.of(model)
-            shape_sigma = np.full(len(shapes), EXACT) if prior.is_board_exact else shape_sigma
+            shape_sigma = np.full(len(shapes), _EXACT_M) if prior.is_board_exact else shape_sigma
         information[P:, P:] = np.diag(shape_sigma**-2)
         return cls(corners_px, corners, shapes, mean, information, model)
 

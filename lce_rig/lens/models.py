@@ -157,8 +157,8 @@ _OF_CORNER = 0.4
 # Share of the whole distortion by which decentring displaces a pixel in the corner. Boards hardly separate it
 # from a shift of the principal point; its coefficients p1, p2 are the tangential ones of the radtan models.
 _DECENTRING = 0.4
-EXACT = 1e-6
-"""Standard deviation of an exact constant, m, rad or relative: far below any that data determine."""
+# Standard deviations of intrinsics stated as exact.
+_EXACT, _EXACT_PX = 1e-7, 1e-4
 
 
 @dataclass(frozen=True)
@@ -219,17 +219,17 @@ class LensPrior:
         _, _, by_lens = model.project(vector, rays)
         D = by_lens[..., 4:].reshape(-1, model.size - 4)
         information = np.zeros((model.size, model.size))
-        sigma_px = max(_OF_CORNER * self.distortion_px, EXACT * focal_px)
+        sigma_px = max(_OF_CORNER * self.distortion_px, _EXACT_PX)
         information[4:, 4:] = D.T @ D / (len(rays) * sigma_px**2)
         if model.family == "radtan":
             corner = (self.lens.width_px**2 + self.lens.height_px**2) / (2 * focal_px) ** 2
-            sigma_px = max(self.decentring_px, EXACT * focal_px)
+            sigma_px = max(self.decentring_px, _EXACT_PX)
             tangential = [4 + model.coefficients.index(name) for name in ("p1", "p2")]
             information[tangential, tangential] += (3 * corner * focal_px / sigma_px) ** 2
-        information[[2, 3], [2, 3]] = max(self.principal_point_px, EXACT * focal_px) ** -2
+        information[[2, 3], [2, 3]] = max(self.principal_point_px, _EXACT_PX) ** -2
         aspect = min(_ASPECT, self.focal_length)
         for row, sigma in (([0.5, 0.5], self.focal_length), ([1.0, -1.0], aspect)):
-            information[:2, :2] += np.outer(row, row) / (max(sigma, EXACT) * focal_px) ** 2
+            information[:2, :2] += np.outer(row, row) / (max(sigma, _EXACT) * focal_px) ** 2
         return vector, information
 
 

@@ -16,8 +16,7 @@ SIGMAS_RAD = tuple(0.024 / 2**level for level in range(4))
 _WORKING_FOCAL_PX = 1000.0  # Focal length above which images are halved first, px.
 _WEAKEST_GREY = 2.0  # Gradient of noise: an image without stronger edges has none.
 _CLIP_PERCENTILE = 99  # of gradients: stronger edges count no more
-_WINDOW_RAD = 5 * SIGMAS_RAD[0]  # Window across an edge, at least,
-_WINDOW_SIGMAS = 20.0  # and in sigmas of the blur,
+_WINDOW_RAD, _WINDOW_SIGMAS = 0.12, 20.0  # Window across an edge, at least, and in sigmas of the blur,
 _WINDOW_ASPECT = 4  # by its length along the edge.
 _FLOOR = 0.005  # of the mean edge strength in a window, as a share of the strongest
 _OUTLIERS = 0.5  # Fraction of outlines without an image edge.
@@ -41,7 +40,9 @@ class EdgeLayer:
     def sample(self, pixels: Array) -> Array:
         """Interpolate value and derivatives (N, 3) at pixels (N, 2) of the image; 0 outside."""
         at = places(pixels, self.reduction)
-        parts = [self.interpolate(at[:, k : k + _LARGEST]) for k in range(0, len(pixels), _LARGEST)]
+        parts = [
+            self.interpolate(at[:, k : k + _REMAP_COLUMNS]) for k in range(0, len(pixels), _REMAP_COLUMNS)
+        ]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
     def interpolate(self, at: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -60,10 +61,11 @@ def places(pixels: Array, reduction: int | NDArray[np.intp]) -> NDArray[np.float
         reduction: reduction factor of the field, or of each pixel's field (N,).
     """
     at = (pixels.T + 0.5) / reduction - 0.5
-    return np.asarray(np.fmin(np.fmax(at, -_LARGEST), _LARGEST), dtype=np.float32, order="C")
+    return np.asarray(np.fmin(np.fmax(at, _FAR_OUTSIDE), -_FAR_OUTSIDE), dtype=np.float32, order="C")
 
 
-_LARGEST = 32767  # OpenCV's largest coordinate and row of samples: 16 bits.
+_REMAP_COLUMNS = 32767  # OpenCV's largest row of samples.
+_FAR_OUTSIDE = -1e4  # px; OpenCV's coordinates have 16 bits.
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,17 +21,16 @@ REACH = np.repeat([0.2, np.radians(2.0)], 3)
 """Region searched about the start by default, m and rad."""
 
 _UNITS = REACH / 4  # Steps of like effect, for the search.
-_STEPS = _UNITS / 10  # of numerical differences
 # Random starts at each width of the fields, coarse to fine, and maxima kept from it.
 _N_STARTS, _N_KEPT = (300, 300, 300, 0), (8, 8, 8, 3)
 _SEARCH_EDGES = 3000  # on all but the finest fields
-_COARSE = 1e-6  # Relative gain of a step that ends a climb on wide fields; on the finest, scipy's.
+_COARSE, _FINE = 1e-6, 2e-9  # Relative gain of a step that ends a climb, on wide fields and the finest
 _SAME = 0.5  # Distance in units below which two maxima are one.
 _BEYOND = 1.5  # Largest distance from the start, in reaches
 
 # Chosen on KITTI's views, simulated rooms and streets, and boards of os1_64, acfr_vlp16, rlfs01 and rlfs02.
 _INFLATION = 2.0  # of standard deviations: neighbouring blocks share surfaces
-_BIAS = np.r_[np.full(3, 0.02), np.radians([0.03, 0.03, 0.06])]
+_BIAS = np.array([0.02, 0.02, 0.02, *np.radians([0.03, 0.03, 0.06])])
 """Standard deviation of errors that all edges of a scene share: beam width, lens, time. m, rad."""
 _LEAST_CURVATURE = 1e-3  # of the largest; the reach bounds the variance of flatter directions
 
@@ -43,7 +42,8 @@ _NEAR_SIGMAS = 2.0  # Displacement of extrinsics within their errors, along each
 _NOTICED = 27.04
 _CONTROL_SIGMAS = 3.0  # Displacement after which extrinsics must score less.
 _UNDETERMINED = 0.5  # Standard deviation of an undetermined direction, in reaches.
-_FOCAL_STEP = 0.01  # Smallest relative change of the focal lengths that is compared.
+_LENS_STEP_RAD = 1e-3  # Displacement in the image, by focal length, of a difference by the intrinsics
+_FOCAL_STEPS = (-0.02, -0.01, 0.01, 0.02)  # Relative changes of the focal lengths that are compared.
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,19 +149,17 @@ def find_better_focal(
     """
     own = OutlineScore.finest(views, intrinsics, T_cam_lidar)
     best_value, better = own.value(np.zeros(6)), None
-    for n_steps in (-2, -1, 1, 2):
-        scale = 1 + n_steps * _FOCAL_STEP
+    for step in _FOCAL_STEPS:
+        scale = 1 + step
         lens = replace(intrinsics, fx_px=scale * intrinsics.fx_px, fy_px=scale * intrinsics.fy_px)
         score = OutlineScore.finest(views, lens, T_cam_lidar)
         tangent, value = _climb(score, np.zeros(6), REACH)
         if value > best_value and significance(score, tangent, own, np.zeros(6)) > MIN_GAIN:
-            best_value, better = value, n_steps * _FOCAL_STEP
+            best_value, better = value, step
     return better
 
 
-def _climb(
-    score: OutlineScore, start: Array, reach: Array, precision: float | None = None
-) -> tuple[Array, float]:
+def _climb(score: OutlineScore, start: Array, reach: Array, precision: float = _FINE) -> tuple[Array, float]:
     """Climb from a start to the next maximum (6,), until the relative gain of a step is below `precision`.
 
     Returns:
@@ -176,7 +174,7 @@ def _climb(
         return -value, -slope * units
 
     bounds = [(-limit, limit) for limit in _BEYOND * reach / units]
-    options = {} if precision is None else {"ftol": precision}
+    options = {"ftol": precision}
     climbed = minimize(fall, start / units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return np.asarray(climbed.x * units), -float(climbed.fun)
 
@@ -200,7 +198,7 @@ def _search(levels: Sequence[OutlineScore], reach: Array) -> list[Array]:
         starts = rng.uniform(-1, 1, (n_starts, 6)) * reach
         order = np.argsort([-level.value(start) for start in starts])
         maxima += list(starts[order[:n_kept]])
-        precision = None if level is levels[-1] else _COARSE
+        precision = _FINE if level is levels[-1] else _COARSE
         found = [_climb(level, start, reach, precision) for start in maxima]
         climbed = sorted(found, key=lambda each: -each[1])
         distinct: list[Array] = []
@@ -278,7 +276,7 @@ def _covariance(score: OutlineScore, tangent: Array, reach: Array) -> Array:
 def _inverse_curvature(score: OutlineScore, tangent: Array) -> Array:
     """Invert the curvature (6, 6) of the score at a maximum; flat directions count as slightly curved."""
     curvature = np.empty((6, 6))
-    for axis, step in enumerate(_STEPS):
+    for axis, step in enumerate(_UNITS / 10):
         either = [score.score(tangent + sign * step * np.eye(6)[axis])[1] for sign in (1, -1)]
         curvature[axis] = -(either[0] - either[1]) / (2 * step)
     scale = np.outer(_UNITS, _UNITS)
@@ -307,7 +305,7 @@ def follow_lens(
     _, _, by_lens = model.project(vector, grid_rays(intrinsics)[1])
     largest_px = np.abs(by_lens @ changes).max(axis=(0, 1))
     motions = []
-    for change, step in zip(changes.T, _STEPS[-1] * intrinsics.fx_px / largest_px, strict=True):
+    for change, step in zip(changes.T, _LENS_STEP_RAD * intrinsics.fx_px / largest_px, strict=True):
         lenses = [model.intrinsics(vector + sign * step * change, *size_px) for sign in (1, -1)]
         either = [OutlineScore.finest(views, lens, T_cam_lidar).score(np.zeros(6))[1] for lens in lenses]
         motions.append(inverse @ (either[0] - either[1]) / (2 * step))

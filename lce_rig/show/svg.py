@@ -16,7 +16,7 @@ BLUE, ORANGE = "var(--blue)", "var(--orange)"
 
 EM = 8.5
 """Size of the font; all lengths of this module are units of the view box, as long as a point in print."""
-WIDTH = 38 * EM
+WIDTH = 320.0
 """Width of every drawing: legible on a phone, and a wide screen shows several side by side."""
 LEFT, RIGHT, TOP, BOTTOM = 4 * EM, EM, 2 * EM, 4 * EM
 """Margins around the axes, for ticks and labels."""

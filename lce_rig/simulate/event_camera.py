@@ -24,7 +24,7 @@ _NS_PER_US = 1000
 _LEAST_THRESHOLD = 0.05
 # A pixel in the dark keeps this share of the bandwidth that full white gives it: the photoreceptor's bias.
 _DARK_BANDWIDTH = 0.1
-_HOT_HZ = (10.0, 300.0)
+_HOT_HZ, _HOT_ON_SHARE = (10.0, 300.0), 0.95
 
 
 class EventPixels(NamedTuple):
@@ -183,8 +183,7 @@ class EventCamera:
         t_s = self._rng.uniform(start_s, end_s, n)
         pixel = np.searchsorted(summed_hz, self._rng.uniform(0.0, summed_hz[-1], n), side="right")
         pixel = np.minimum(pixel, len(summed_hz) - 1)
-        # Hot pixels brighten only.
-        on_share = np.where(hot_hz[pixel] > 0, 1.0, 0.5)
+        on_share = np.where(hot_hz[pixel] > 0, _HOT_ON_SHARE, 0.5)
         noise = _Raw(t_s, pixel, self._rng.random(n) < on_share)
         together = join_rows([*self._raw, noise])
         self._raw, self._taken_s = [], self._now_s

@@ -59,8 +59,8 @@ def _echoes(scene: Scene, hits: Hits, origins: Array, directions: Array) -> Retu
 #: Points of a beam probed for a second surface, in half-widths.
 _PROBES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 # Cells of equal energy over a beam: positions (K, 2) in half-widths, within an ellipse of radius 1.
-_GRID = np.stack(np.meshgrid(*((2 * np.arange(n) + 1) / n - 1 for n in (16, 8)), indexing="ij"), axis=-1)
-_CELLS = _GRID[np.hypot(_GRID[..., 0], _GRID[..., 1]) <= 1]
+_GRID = np.stack(np.meshgrid((np.arange(16) - 7.5) / 8, (np.arange(8) - 3.5) / 4, indexing="ij"), axis=-1)
+_CELLS = _GRID[np.hypot(_GRID[..., 0], _GRID[..., 1]) <= 1.0]
 #: Surfaces of one footprint nearer to each other than this blend into one return.
 _PULSE_M = 0.5
 

@@ -31,8 +31,10 @@ from lce_rig.simulate.stage import (
     Stage,
     set_stage,
 )
-from lce_rig.simulate.subframes import STEP_PX, MovingView, film, speed_px_s
+from lce_rig.simulate.subframes import MovingView, film, speed_px_s
 
+# Largest motion of the board in the image between two renderings of one exposure, px.
+_SMEAR_STEP_PX = 0.35
 _MOST_MOMENTS = 15
 
 Stream = tuple[int, ...]
@@ -78,7 +80,7 @@ class StagedBoard:
         stage, options = self.stage, self.stage.options
         backdrop = stage.backdrops[camera]
         smear_px = options.exposure_s * speed_px_s(self.trajectory, stage.board, backdrop, exposed_ns)
-        n_moments = int(np.clip(np.ceil(smear_px / STEP_PX), 1, _MOST_MOMENTS))
+        n_moments = int(np.clip(np.ceil(smear_px / _SMEAR_STEP_PX), 1, _MOST_MOMENTS))
         middles = (np.arange(n_moments) + 0.5) / n_moments - 0.5
         moments_ns = exposed_ns + np.rint(1e9 * options.exposure_s * middles).astype(np.int64)
         scene = self.scene_at(exposed_ns)

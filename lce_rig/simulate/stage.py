@@ -26,10 +26,9 @@ from lce_rig.simulate.room import LIDAR_HEIGHT_M, Room, build_room
 OF_SESSION = 1_000_000_007
 TRUTH, ROOM, LASERS, START, PLACEMENT, SCAN, IMAGE, PIXELS, HAND, CARRIER, PHASE, EVENTS = range(12)
 # T_cam_lidar of a camera without nominal extrinsics: 8 cm above and in front of the LiDAR, facing forward.
-_FORWARD = pose(T_BODY_OPTICAL[:3, :3].T, -0.08 * np.array([0, 1, 1]))
-# View of 90 deg, ahead of its first LiDAR, in which boards of a rig without cameras are placed.
-_SIZE_PX = np.array([1280, 720])
-_WINDOW = Intrinsics(*np.repeat(_SIZE_PX[0] / 2, 2), *(_SIZE_PX - 1) / 2, *_SIZE_PX)
+_FORWARD = pose(T_BODY_OPTICAL[:3, :3].T, np.array([0.0, -0.08, -0.08]))
+# View, ahead of its first LiDAR, in which boards of a rig without cameras are placed.
+_WINDOW = Intrinsics(600.0, 600.0, 640.0, 360.0, 1280, 720)
 
 
 @dataclass(frozen=True, eq=False)

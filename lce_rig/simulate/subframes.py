@@ -24,9 +24,9 @@ GREY = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in a grey value (ITU-R BT.601), as OpenCV's."""
 Window = tuple[slice, slice]
 Float = NDArray[np.float32]
-STEP_PX = 0.4
-"""Largest motion of the board between views, px: below a pixel, so that edges cross each one gradually."""
-# Limits of the interval between sub-frames.
+# Motion of the board between sub-frames, px, as long as their interval is within `_STEP_NS`: below a pixel,
+# so that edges cross each one gradually.
+_STEP_PX = 0.4
 _STEP_NS = (500_000, 5_000_000)
 _ALONG = np.linspace(0, 1, 17)[:, None, None]
 # Mean square distance of a pixel's area from its middle, px^2, along one axis.
@@ -77,7 +77,7 @@ class MovingView:
     def step_ns(self, t_ns: int) -> int:
         """Choose how long after t_ns the next sub-frame is due."""
         speed = speed_px_s(self.trajectory, self.board, self.backdrop, t_ns)
-        return int(np.clip(1e9 * STEP_PX / max(speed, 1e-3), *_STEP_NS))
+        return int(np.clip(1e9 * _STEP_PX / max(speed, 1e-3), *_STEP_NS))
 
     def _board(self, window: Window, T_world_board: Array) -> tuple[Float, Float]:
         """Compute the board's radiance and its cover (h, w) of each pixel, 0..1."""

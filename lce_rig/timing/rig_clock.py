@@ -24,6 +24,8 @@ from lce_rig.timing.triggers import TriggerMatcher
 
 _N_EDGES = 2048
 _WINDOW_NS = 60 * NS_PER_S
+# Share of the least time between two pulses within which an edge belongs to a pulse.
+_NEAR = 0.4
 _MIN_MATCHED = 0.5
 #: Rate of the pulses while the first images are matched.
 SLOW_TRIGGERS_HZ = 4.0
@@ -112,11 +114,11 @@ class EdgeClock:
         if len(seen_ns) < MIN_PAIRS:
             return None
         least_ns = float(np.diff(sent_ns).min())
-        if self._model is None and self._coarse_error_ns > least_ns / 2:
+        if self._model is None and self._coarse_error_ns > _NEAR * least_ns:
             sigma_ms, period_ms = self._coarse_error_ns / 1e6, least_ns / 1e6
             self.problem = findings.EDGES_TOO_CLOSE(self._sensor, sigma_ms=sigma_ms, period_ms=period_ms)
             return None
-        edges = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, least_ns / 2))
+        edges = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
         if len(edges[0]) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
             self.problem = findings.EDGES_NOT_THE_PULSES(self._sensor)
             return None

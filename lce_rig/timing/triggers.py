@@ -23,6 +23,8 @@ N_AGREE = 4
 
 _N_WAITING = 64
 _N_DELAYS = 31
+# Largest deviation of an image's delay from the median, as a share of the pulses' period.
+_NEAR = 0.3
 _N_PULSES = 1024
 _N_RECENT = 8
 # Largest difference in number of two received pulses between which missing ones are interpolated.
@@ -169,7 +171,7 @@ class TriggerMatcher:
             self.counts["n_unmatched"] += 1
             return
         delay_ns = frame.board_ns - self._pulses[number]
-        if abs(delay_ns - median(self._delays_ns)) < self._period_ns() / 2:
+        if abs(delay_ns - median(self._delays_ns)) < _NEAR * self._period_ns():
             self._n_odd = 0
             yield self._matched(frame, number)
             self._delays_ns.append(delay_ns)

@@ -8,9 +8,7 @@ from lce_rig.show.tables import result_tables
 from tests.export.conftest import calibration
 
 
-@pytest.mark.parametrize(
-    ("corrected_m", "shown"), [(0.0052, ["5.2 mm"]), (0.0089, ["8.9 mm"]), (float("nan"), [])]
-)
+@pytest.mark.parametrize(("corrected_m", "shown"), [(0.0052, ["5.2 mm"]), (0.0089, []), (float("nan"), [])])
 def test_fit_states_planes_without_lidar_errors(corrected_m, shown):
     plain = calibration()
     c = replace(plain, diagnostics=replace(plain.diagnostics, mpe_corrected_m=corrected_m))

@@ -31,15 +31,15 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Certificate, Diagnostics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import SIGMA_PER_MAD, Array, pose
 from lce_rig.core.results import Observation
 
 NOMINAL_SIGMA_M = 0.01
 """Residuals for the first weights of captures; weights are reported in units of it."""
 # Fraction of the plane terms that are kept: those with the smallest propagated variance.
 _KEPT_SHARE = 0.9
-# Largest error attributed to noise, as a multiple of the median of all captures.
-_TIMES_MEDIAN = 3.0
+# Largest error attributed to noise: in deviations from the median of all captures, and as a multiple of it.
+_DEVIATIONS, _TIMES_MEDIAN = 6.0, 3.0
 # Smaller disagreements count as noise, even if the other captures agree better, m.
 _FLOOR_M = 0.02
 _MAX_SHARE = 0.25
@@ -246,4 +246,6 @@ def reject_outliers(
 
 def _excess(errors: Array) -> Array:
     """Divide errors (F,) by the largest error attributed to noise."""
-    return errors / max(_TIMES_MEDIAN * float(np.median(errors)), _FLOOR_M)
+    median = float(np.median(errors))
+    deviation = SIGMA_PER_MAD * float(np.median(np.abs(errors - median)))
+    return errors / max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)

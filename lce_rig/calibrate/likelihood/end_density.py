@@ -18,7 +18,6 @@ from functools import lru_cache
 import numpy as np
 
 from lce_rig.calibrate.likelihood.layout import Indices
-from lce_rig.calibrate.likelihood.levels import MOST_LOST
 from lce_rig.calibrate.likelihood.rays import EdgeRows
 from lce_rig.core.geometry import Array
 
@@ -30,7 +29,7 @@ _LOST_STEPS = 1.1
 # ones leave a normal density.
 _NARROWEST = 0.01
 _BLURS = np.geomspace(_NARROWEST, 30.0, 60)
-_SHARES = MOST_LOST * np.linspace(0, 1, 9) ** 2
+_SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
 
 
 def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:

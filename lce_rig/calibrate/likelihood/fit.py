@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import EXACT, LOG_SIGMA, MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Evidence, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, no_scans, stack_scans
 from lce_rig.calibrate.observations import group_poses
@@ -25,7 +25,6 @@ from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import HUBER, Array, invert, perturb
 from lce_rig.core.results import BoardPose, LidarBoard, Observation, PatternBoard
-from lce_rig.lens.models import EXACT
 
 # Maximum number of steps between two fits of the levels, and after the last one.
 STEPS, _LAST_STEPS = 3, 20
@@ -36,14 +35,16 @@ _LEVEL_ROUNDS = (8, 4, 8)
 # First blurs of ring ends, rad. Until the edge shift is known, all ends may lie outside their intervals,
 # where a sharp density is flat.
 BLURS_RAD = (4e-3, 1.5e-3)
-# Levels lie within a factor of a hundred of the typical value.
-_LOG_FACTOR = 4.6
+# Levels lie within these factors of the typical value, e^-4.6 and e^3.
+_BELOW, _ABOVE = -4.6, 3.0
 # Largest influence of a placement, in standard deviations: its weight stays above 0.
 _FARTHEST = 1e6
 # Number of plain steps before Anderson mixing, and of steps that it combines.
 _PLAIN, _MIXED = 3, 5
 # Errors of lens and board that `Priors.held` fixes.
 _HELD = ("pattern_offset", "intrinsics")
+# Squared length of a step that counts as diverged, in standard deviations.
+_DIVERGED = 1e12
 # Largest ratio of a mixed step's length to the plain one's.
 _LONGEST = 5.0
 
@@ -325,7 +326,7 @@ def descend(
     for _ in range(n_steps):
         reduced = reduce(terms)
         # Far from any optimum steps may diverge: keep the last finite terms.
-        if not np.isfinite(reduced.decrement):
+        if not reduced.decrement < _DIVERGED:
             return finite
         finite = terms
         if reduced.decrement < short**2:
@@ -385,8 +386,8 @@ def fit_levels(
         off = (x / scale - middle) / sigma
         return value + float(off @ off), (slopes + 2 * off / sigma) / scale
 
-    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _LOG_FACTOR)
-    bounds = list(zip((middle - _LOG_FACTOR) * scale, highest * scale, strict=True))
+    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
+    bounds = list(zip((middle + _BELOW) * scale, highest * scale, strict=True))
     options = {"maxiter": n_rounds, "ftol": 1e-6}
     first = np.log([getattr(start, name) for name in names]) * scale
     best = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)

@@ -9,7 +9,6 @@ from lce_rig.calibrate.algorithm_1.background import BACKGROUND_SIGMAS_M
 from lce_rig.calibrate.options import EstimateSettings, KnownLidar
 from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array
-from lce_rig.lens.models import EXACT
 
 
 @dataclass(frozen=True)
@@ -77,6 +76,10 @@ LOG_SIGMA: Mapping[str, float] = {
 MOST_LOST = 0.6
 OF_IMAGES = ("tilt_rad", "spin_rad", "depth_m", "across_m")
 """The levels of a board's pose in an image."""
+
+
+EXACT = 1e-6
+"""Standard deviation of an exact constant, m, rad or relative: far below any that data determine."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.end_density import edge_products
 from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
 from lce_rig.calibrate.likelihood.layout import BOARD, END, LASER, OWN, RING, Columns, Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import EXACT, OF_IMAGES, Levels, Priors
 from lce_rig.calibrate.likelihood.rays import (
     EdgeRows,
     RangeSums,
@@ -26,7 +26,6 @@ from lce_rig.calibrate.likelihood.rays import (
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.lens.models import EXACT
 
 # Step of a level's logarithm for numerical differences.
 _LOG_STEP = 1e-4

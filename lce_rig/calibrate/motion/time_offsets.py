@@ -39,11 +39,13 @@ from lce_rig.core.results import Observation
 
 MIN_MOVING = 6
 """Fewer captures with images of several times do not determine time offsets."""
-# Prior standard deviation of time offsets, s, of images without timestamps or tolerance, which may have been
-# taken at any time around the scan.
-_UNKNOWN_SIGMA_S = 0.15
-# Step of the grid searched, s, and its number of steps to either side; step of numerical differences.
-_GRID_S, _N_GRID = 0.04, 5
+# Ratio of mean squared rates to noise above which boards moved.
+_MOVED = 1.0
+# Prior standard deviations of time offsets, s: for a profile without a tolerance, and for images without
+# timestamps, which may have been taken at any time around the scan.
+_TOLERANCE_S, _NO_STAMPS_SIGMA_S = 0.05, 0.15
+# Offsets searched, and step of the grid, s; step of numerical differences.
+_REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = _GRID_S / 10
 _N_ITERATIONS = 6
 _CONVERGED_S = _STEP_S / 8
@@ -115,8 +117,8 @@ def estimate_motion(
     for c, channel in enumerate(samples.channels):
         images = [(scan.images[channel], scan.lidar) for scan in still.scans if channel in scan.images]
         is_stamped = all(image.stamp_ns is not None and lidar.stamp_ns is not None for image, lidar in images)
-        tolerance_s = clocks.tolerance_s.get(channel, _UNKNOWN_SIGMA_S)
-        prior_sigma_s[c] = tolerance_s if is_stamped else _UNKNOWN_SIGMA_S
+        tolerance_s = clocks.tolerance_s.get(channel, _TOLERANCE_S)
+        prior_sigma_s[c] = tolerance_s if is_stamped else _NO_STAMPS_SIGMA_S
     observations = [scan.observation() for scan in scans]
     times_s = np.array([board_time_s(observation.lidar, clocks.sweep_s) for observation in observations])
     offset_s = _search_grid(samples, observations, start.T_cam_lidar, prior_sigma_s, times_s)
@@ -134,8 +136,7 @@ def estimate_motion(
     cov = inverse @ (few * gradients.T @ gradients + cost.precision) @ inverse
     # Uninformative captures scatter little, so the variance is at least that from the curvature of (1).
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
-    # Noise alone gives 1.
-    if fit_motions(samples, offset_s).significance <= 1:
+    if fit_motions(samples, offset_s).significance <= _MOVED:
         return still
     return replace(still, offset_s=offset_s, cov=widen[:, None] * cov * widen, sensitivity=T_rates)
 
@@ -231,7 +232,7 @@ def _search_grid(
 ) -> Array:
     """Search a grid for the offsets (C,) that bring the boards' centres closest to the camera's planes."""
     middles = np.array([observation.lidar.points.mean(axis=0) for observation in observations])
-    ticks = _GRID_S * np.arange(-_N_GRID, _N_GRID + 1)
+    ticks = np.arange(-_REACH_S, _REACH_S + _GRID_S / 2, _GRID_S)
     best, best_cost = np.zeros(len(samples.channels)), np.inf
     for ticks_s in product(ticks, repeat=len(samples.channels)):
         offset_s = np.array(ticks_s)

@@ -33,9 +33,11 @@ from lce_rig.core.results import BoardPose
 FEWEST_POINTS = 6
 _SAMPLES = 48
 # Positions of the two returns that represent a ring, fractions of its chord: exact for second moments.
-_NODES = (1 + np.polynomial.legendre.leggauss(2)[0]) / 2
+_NODES = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12)
 # Noise of a corner per coordinate, px: typical of recordings.
 _CORNER_PX = 0.05
+# Prior of rough extrinsics, m and rad, which keeps every direction finite.
+_PRIOR_SIGMAS = np.repeat([1.0, 0.5], 3)
 # Unknowns of a leave-one-out covariance: the extrinsics and the edge shift.
 _N_UNKNOWNS = 7
 # Unknowns that captures determine or that affect the result, without fixed ones; the pattern is added last.
@@ -176,8 +178,7 @@ class Predictor:
         terms = self._linearise(T_cam_lidar @ ahead, cross_board(model, ahead))
         kept = terms.state.layout.z.of(_UNKNOWNS)
         self._prior = assemble(terms, self._levels, self._priors).cost.prior[kept[:, None], kept]
-        # A prior of 1 m and 1 rad keeps every direction of the extrinsics finite.
-        self._prior[:6, :6] += np.eye(6)
+        self._prior[:6, :6] += np.diag(_PRIOR_SIGMAS**-2.0)
         self._to_extrinsics = extrinsics_by_unknowns(terms)[0][:, kept]
 
     def weigh(self, T_cam_board: Array) -> Evidence:

@@ -16,8 +16,10 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 _STEP_M = 0.6  # Length of a person's step to the side.
 _ROTATIONS = ("tilt", "turn", "roll")
-# Differences below which no instruction is given: people cannot correct smaller ones.
-_DEAD_M, _DEAD_DEG = 0.15, 10.0
+#: Differences, m and deg, below which no instruction is given: people cannot correct smaller ones.
+DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
+#: Tolerance of every pose figure at the target, in dead bands.
+THERE = 1.5
 
 
 @dataclass(frozen=True)
@@ -89,10 +91,10 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str
         wanted: (4, 4) T_cam_board to reach.
     """
     changes = _changes(view, present, wanted)
-    limits = dict.fromkeys(changes, _DEAD_M) | dict.fromkeys(_ROTATIONS, _DEAD_DEG)
+    # Dead bands make ways and angles comparable.
+    sizes = {kind: abs(amount) / DEAD_BANDS[kind] for kind, amount in changes.items()}
     ordered = sorted(
-        (kind for kind, amount in changes.items() if abs(amount) > limits[kind]),
-        key=lambda kind: (kind in _ROTATIONS, -abs(changes[kind])),
+        (kind for kind in sizes if sizes[kind] > 1), key=lambda kind: (kind in _ROTATIONS, -sizes[kind])
     )
     return {kind: _in_words(kind, changes[kind]) for kind in ordered}
 
@@ -104,7 +106,8 @@ def say(instructions: Mapping[Kind, str]) -> str:
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
     """Check whether a board (4, 4) is as close to its target pose (4, 4) as people can hold it."""
-    return not instruct(view, present, wanted)
+    changes = _changes(view, present, wanted)
+    return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
 
 
 def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, float]:

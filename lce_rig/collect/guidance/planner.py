@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT, CALIBRATE_LITTLE_GAIN, GUIDE_ADD
 from lce_rig.collect.guidance.evidence import Predictor, few_captures_factor, shortfall, sigmas
 from lce_rig.collect.guidance.instructions import describe_pose, instruct, is_there, say
-from lce_rig.collect.guidance.sensor_model import (
-    DIAMOND_DEG,
-    ROLLS_DEG,
-    TILT_DEG,
-    SensorModel,
-    SensorPlace,
-    spread_candidates,
-)
+from lce_rig.collect.guidance.sensor_model import DIAMOND_DEG, SensorModel, SensorPlace, spread_candidates
 from lce_rig.collect.placement_dedupe import MIN_MOVE_M, MIN_TURN_DEG, find_alike
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
@@ -29,7 +22,9 @@ from lce_rig.rig import Rig
 #: Span of the captures that fills a bar, as a fraction of the reachable placements' span.
 FULL_SHARE = 0.7
 #: Minimum angle at which a board is described as tilted to a side, deg.
-LEANS_DEG = FULL_SHARE * TILT_DEG
+LEANS_DEG = 15.0
+#: Range of the boards' rolls that fills the bar, deg.
+FULL_ROLL_DEG = 20.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +68,7 @@ def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Covera
         up_down=float(up_down),
         near_far=float(near_far),
         tilt=float(leanings.mean()),
-        roll=float(min(np.ptp(roll) / (FULL_SHARE * np.ptp(ROLLS_DEG)), 1.0)),
+        roll=float(min(np.ptp(roll) / FULL_ROLL_DEG, 1.0)),
     )
 
 
@@ -89,7 +84,9 @@ def _places(view: SensorPlace, T_cam_board: Array) -> Array:
 
 #: Fraction of the target at which the predicted standard deviation counts as sufficient.
 ENOUGH_SHARE = 0.9
-#: Minimum gain of a new placement; a smaller gain adds nothing, unless no placement adds more.
+#: Minimum gain of a new placement, as a fraction of the best placement's gain; a smaller gain adds nothing.
+LEAST_SHARE = 0.1
+#: Gain of the best placement below which any new placement is accepted.
 LEAST_GAIN = 0.02
 #: Radius around an unreachable placement.
 AVOIDED_M = 0.4
@@ -299,7 +296,7 @@ class Planner:
         gain, best = np.asarray(
             1 - shortfall(model, after - self._limit) / shortfall(model, now - self._limit)
         )
-        if best < LEAST_GAIN or gain >= LEAST_GAIN:
+        if best < LEAST_GAIN or gain >= LEAST_SHARE * best:
             return None
         gains = {"gain": max(float(gain), 0.0), "best_gain": float(best)}
         return CALIBRATE_LITTLE_GAIN.refusal(instruction=instruction, **gains)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.likelihood.levels import Levels, Priors, what_is_known
+from lce_rig.calibrate.likelihood.levels import EXACT, Levels, Priors, what_is_known
 from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings, KnownLidar, Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -13,7 +13,6 @@ from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import EVEN_STEPS, Array, exp_so3, invert, pose
 from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
-from lce_rig.lens.models import EXACT
 from lce_rig.rig import QualitySettings, Rig
 
 
@@ -99,21 +98,23 @@ def _as_measured(priors: Priors, levels: Levels, known: KnownLidar) -> tuple[Pri
 #: Minimum planned distance of the board from the camera, m: closer, it exceeds the image or the LiDAR's field
 #: of view.
 NEAREST_M = 1.2
-#: Tilts of planned placements, deg: none, and two rings of directions at this angle and at twice it; steeper
-#: ones shorten the squares.
-TILT_DEG = 21.0
+#: Tilts of planned placements, deg: none, and two rings of directions; steeper ones shorten the squares.
+TILTS_DEG = (0.0, 22.0, 42.0)
 N_TILT_DIRECTIONS = 8
 _N_TILTS = 8
 #: Rotation as a diamond, deg: each ring then crosses two slanted edges.
 DIAMOND_DEG = 45.0
-ROLLS_DEG = 12.0 * np.arange(-1, 2)
+ROLLS_DEG = (-12.0, 0.0, 12.0)
 #: Fraction of the plate's height that must lie within the LiDAR's vertical field of view.
 SEEN_SHARE = 0.8
-#: Largest height of the board's centre above or below the LiDAR, m: the reach of a person's arms.
-REACH_M = 0.8
-# Free border of the image, and of the field of view of a LiDAR without rings, as a fraction of its width:
-# people do not hold the board to the pixel.
+# Scale of the plate that must lie within the field of view of a LiDAR without rings: a truncated plate is
+# refused.
+_FREE_SHARE = 1.2
+#: Lowest and highest position of the board's centre relative to the LiDAR, m: the reach of a person's arms.
+REACH_M = (-0.9, 0.8)
+# Free border of the image, as a fraction of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
+_GRAZING_COSINE = 0.45
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +165,14 @@ def spread_candidates(view: SensorPlace, n_places: int) -> Array:
     # Equal steps in 1/distance: nearby boards differ more from one another.
     distance_m = 1 / (1 / NEAREST_M + (1 / far_m - 1 / NEAREST_M) * even[:, 2])
     # List all tilts (T, 2) about the level axis and the upward one, rad.
+    straight, *tilted = np.radians(TILTS_DEG)
     direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
     circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    tilts = np.radians(TILT_DEG) * np.concatenate([np.zeros((1, 2)), circle, 2 * circle])
+    tilts = np.concatenate([[[straight, straight]], *(tilt_rad * circle for tilt_rad in tilted)])
     # Use some of the tilts at each place and the following ones at the next place.
     which = np.arange(n_places * _N_TILTS)
     tilt = tilts[(which * 5) % len(tilts)]
-    roll = np.radians(DIAMOND_DEG + ROLLS_DEG[(which // len(tilts)) % len(ROLLS_DEG)])
+    roll = np.radians(DIAMOND_DEG + np.array(ROLLS_DEG)[(which // len(tilts)) % len(ROLLS_DEG)])
     place = which // _N_TILTS
     is_known = np.isfinite(rays[place]).all(axis=1)
     place, tilt, roll = place[is_known], tilt[is_known], roll[is_known]
@@ -212,8 +214,7 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     cosine = np.sum(-normal * centre, axis=1) / distance_m
     focal_px = min(model.lens.fx_px, model.lens.fy_px)
     square_px = focal_px * model.board.square_m / distance_m * cosine
-    least_cosine = np.cos(np.radians(limits.max_tilt_deg))
-    ok &= cosine > least_cosine
+    ok &= cosine > np.cos(np.radians(limits.max_tilt_deg))
     least_px = LEAST_MARKED_PX if model.board.has_markers else LEAST_SQUARE_PX
     ok &= square_px > max(least_px, limits.min_square_px)
 
@@ -225,9 +226,9 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
 
     to_lidar = view.T_cam_lidar[:3, 3] - centre
     range_m = np.linalg.norm(to_lidar, axis=1)
-    ok &= np.sum(normal * to_lidar, axis=1) > least_cosine * range_m
+    ok &= np.sum(normal * to_lidar, axis=1) > _GRAZING_COSINE * range_m
     height_m = -to_lidar @ view.up
-    ok &= np.abs(height_m) < REACH_M
+    ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
     # People do not hold a board horizontally.
     return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
 
@@ -235,6 +236,9 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
 def _is_in_lidar_view(view: SensorPlace, outline: Array) -> NDArray[np.bool_]:
     """Check which outlines (N, K, 3), frame camera, the LiDAR sees: whole; with rings, `SEEN_SHARE`."""
     model, T_lidar_cam = view.model, invert(view.T_cam_lidar)
+    if model.pattern != "rings":
+        middle = outline.mean(axis=1, keepdims=True)
+        outline = middle + _FREE_SHARE * (outline - middle)
     seen = outline @ T_lidar_cam[:3, :3].T + T_lidar_cam[:3, 3]
     elevation = np.arctan2(seen[..., 2], np.hypot(seen[..., 0], seen[..., 1]))
     lasers = model.elevations_rad
@@ -246,4 +250,4 @@ def _is_in_lidar_view(view: SensorPlace, outline: Array) -> NDArray[np.bool_]:
     across = 2 * np.arctan2(seen[..., 1], seen[..., 0]) / model.width_rad
     upwards = (2 * elevation - lasers.max() - lasers.min()) / np.ptp(lasers)
     off = np.hypot(across, upwards) if model.pattern == "rosette" else np.maximum(abs(across), abs(upwards))
-    return np.asarray(np.all(off <= 1 - 2 * _MARGIN, axis=1))
+    return np.asarray(np.all(off <= 1, axis=1))

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from lce_rig.collect.findings import CLOCK_SIMULATED
-from lce_rig.collect.guidance.instructions import build_pose, describe_pose, instruct
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
 from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.worker import Worker
@@ -36,7 +36,8 @@ WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
 # Fractions of the way, tried one after the other if an obstacle blocks it.
-_SHARES = np.linspace(1, 0, 4, endpoint=False)
+_SHARES = (1.0, 0.75, 0.5, 0.25)
+_START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
 _N_SLOTS = 32
 
@@ -175,7 +176,11 @@ class _Simulation:
     def __init__(self, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
         self._scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
         self._walker = Walker(self._scene, Person(), views)
-        self._scene.hold(self._walker.choose())
+        if views:
+            camera = next(iter(views))
+            self._scene.hold(self._scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
+        else:
+            self._scene.hold(self._walker.choose())
         self._period_ns = max(model.period_ns for model in self._scene.stage.models.values())
         self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
 

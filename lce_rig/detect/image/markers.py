@@ -47,12 +47,13 @@ _MAX_OFF = 7.0
 _MOST_NEW = 0.25
 # Length of the fitted part of the edges, as a fraction of the distance to the next printed element.
 _FREE = 0.8
-# Threshold of black below its surroundings, in standard deviations of an AprilGrid's noise, if that exceeds
-# OpenCV's.
-_DARKER_SIGMAS = 3.0
+# Threshold of black below its surroundings: minimum and maximum in grey values, and in standard deviations of
+# an AprilGrid's noise.
+_DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
 # Limits of the spacing's difference from the profile's: in tag sides (larger ones shift poses by
 # centimetres), and in standard deviations (smaller ones are not significant).
 _MAX_GAP_OFF, _GAP_SIGMAS = 0.01, 5.0
+_GAP_SHARES = (0.05, 1.2)
 
 
 def find_marked_grid(
@@ -127,9 +128,11 @@ def marker_corners(grey: Grey, board: Board) -> Array:
 def _search(grey: Grey, board: Board, *, is_thorough: bool) -> Places:
     """Find markers of the board's dictionary, at one scale or until half of them are found."""
     places: Places = {}
-    # Black noise pixels join tags to the squares at their corners. Markers of ChArUco boards touch nothing,
-    # and their narrow white margins need the lower threshold.
-    darker = _DARKER_SIGMAS * _noise(grey) if board.type == "aprilgrid" else 0.0
+    darker = _DARKER
+    if board.type == "aprilgrid":
+        # Black noise pixels join tags to the squares at their corners. Markers of ChArUco boards touch
+        # nothing, and their narrow white margins need the lower threshold.
+        darker = min(max(_DARKER_SIGMAS * _noise(grey), _DARKER), _MOST_DARKER)
     for scale, n_border in _attempts(grey.shape[1], board):
         for number, corners in _detect(grey, board.dictionary, scale, n_border, darker).items():
             places.setdefault(number, corners)
@@ -148,7 +151,7 @@ def _attempts(width_px: int, board: Board) -> Iterator[tuple[float, int]]:
         yield from ((scale, n_border) for scale in scales)
 
 
-def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: float = 0.0) -> Places:
+def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: float = _DARKER) -> Places:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = n_border
     parameters.minMarkerPerimeterRate = 0.015
@@ -156,7 +159,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: fl
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.errorCorrectionRate = 1.0
-    parameters.adaptiveThreshConstant = max(darker, parameters.adaptiveThreshConstant)
+    parameters.adaptiveThreshConstant = darker
     book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
     corners, ids, _ = cv2.aruco.ArucoDetector(book, parameters).detectMarkers(resize(grey, scale))
     if ids is None:
@@ -248,7 +251,7 @@ def _measure_gap(crossings: Crossings, board: Board, intrinsics: Intrinsics) -> 
             return np.inf
         return float(np.sum((cv2.perspectiveTransform(on_board[None], H)[0] - flat) ** 2))
 
-    found = minimize_scalar(misfit, bounds=(0, 1), method="bounded")
+    found = minimize_scalar(misfit, bounds=_GAP_SHARES, method="bounded")
     # Nine unknowns: eight of a homography, and the gap.
     variance = found.fun / (2 * len(flat) - 9)
     is_other = misfit(board.gap_share) - found.fun > _GAP_SIGMAS**2 * variance

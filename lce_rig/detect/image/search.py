@@ -35,6 +35,8 @@ STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Hint of a search that was not thorough."""
 
+# Maximum excess of an image over the sensor, relative to the sensor's size; a larger canvas costs memory.
+_CANVAS_FRACTION = 3.0
 # Maximum fraction of corners that the finder misplaced or an artefact covers.
 _MAX_MISPLACED = 0.08
 # Samples per side for tracked boards: a quarter of a full fit's time; corners have 0.03 px, sufficient for
@@ -145,7 +147,7 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
     if 0 <= missing_u <= CUT_FRACTION and 0 <= missing_v <= CUT_FRACTION:
         return grey
-    if missing_u <= 0 and missing_v <= 0:
+    if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
         # Right of and below the sensor's size there is only a smooth background; the columns next to the
         # sensor's are not judged.
         steps = np.abs(np.diff(image.grey.astype(np.int16), axis=1))

@@ -35,7 +35,7 @@ _MOST_CLEAR_MISSES = 0.1
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
-_SMEARS_M = np.linspace(0, 0.06, 13)
+_SMEARS_M = np.append(0.0, np.geomspace(0.005, 0.06, 7))
 _OFFSETS_M = np.linspace(-SLACK_M, SLACK_M, 41)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import SURPRISING_CHI2, Array
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.findings import (
     LIDAR_MOVED,
@@ -73,8 +73,11 @@ _TOUCHED_SHARE = 0.2
 # Distance beyond a located border from which rays should pass the plate, m.
 _CLEAR_M = 0.015
 _STRIP_OFF = 4.0
-# Parts, in order of time, to detect that a plate moved.
-_N_PARTS = 4
+# Maximum blur of a still board's border, m (at most 5 mm on recordings); a wider border is weighted by its
+# width.
+_MOST_SMEAR_M = 0.008
+# Parts, in order of time, to detect that a plate moved, and the limit of their chi2 (6 freedoms, p = 1e-4).
+_N_PARTS, _MOVED_CHI2 = 4, 27.9
 # Minimum number of located places on vertical and on horizontal edges, and of means on the plate, to fix its
 # pose.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
@@ -376,8 +379,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     strips = measure_strips(rays, outline, view.blur_m, np.zeros(4))
     is_touched, *_ = _look_beyond(view, strips, placement)
     smears_m = measure_smears(_beside(rays, strips, is_touched), outline, view.blur_m)
-    # A border wider than a still board's (at most 5 mm on recordings) is weighted by its width.
-    smears_m[smears_m <= EDGE_TOLERANCE_M] = 0.0
+    smears_m[smears_m <= _MOST_SMEAR_M] = 0.0
     if smears_m.any():
         moved_m = _measure_motion(view, outline, smears_m)
         if moved_m is not None:
@@ -488,7 +490,7 @@ def _measure_motion(view: _View, outline: Outline, smears_m: Array) -> float | N
         return None
     away = np.array(places) - np.mean(places, axis=0)
     chi2 = float(np.einsum("ki,kij,kj", away, np.linalg.inv(covs), away))
-    if chi2 < SURPRISING_CHI2:
+    if chi2 < _MOVED_CHI2:
         return None
     return float(np.linalg.norm(np.ptp(places, axis=0)))
 

@@ -23,8 +23,10 @@ BRIGHTER, DARKER = "#ff4646", "#3c96ff"
 # For a slow board all events of this time are drawn, for a fast one the latest per pixel.
 _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
-# Height of a row, inches: of a refusal with its action, or a quarter of an image.
-_DPI, _WIDTH_IN, _ROW_IN = 100, 16, 1.5
+_DIM = 0.45
+_DPI, _WIDTH_IN, _PANE_IN = 100, 16, 5.9
+# Height, inches: of a line that the board was found, and of a refusal with its action.
+_FOUND_IN, _REFUSED_IN = 0.5, 1.5
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"
 
@@ -64,17 +66,20 @@ def draw_debug(
     from matplotlib.style import context
 
     rows = [["camera", "camera", "round", "round"], ["camera", "camera", "above", "face"]]
+    heights_in = [0.3 * _PANE_IN, 0.7 * _PANE_IN]
+    refused = isinstance(image_result, Refusal) or isinstance(lidar_result, Refusal) or mismatch is not None
+    report_in = _REFUSED_IN if refused else _FOUND_IN
     if image is None or events is None:
-        rows, heights = [*rows, ["seen", "seen", "scan", "scan"]], [1, 3, 1]
+        rows, heights_in = [*rows, ["seen", "seen", "scan", "scan"]], [*heights_in, report_in]
     else:
         rows += [["events", "events", name, name] for name in ("seen", "scan", ".")]
-        heights = [1, 3, 1, 1, 2]
-    height_in = _ROW_IN * sum(heights) + 0.4
+        heights_in += [report_in, report_in, _PANE_IN - 2 * report_in]
+    height_in = sum(heights_in) + 0.4
     with context("dark_background"):
         figure: Any = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI)
         at = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 1 - 0.5 / height_in}
         panes = figure.subplot_mosaic(
-            rows, height_ratios=heights, gridspec_kw=at | {"hspace": 0.12, "wspace": 0.1}
+            rows, height_ratios=heights_in, gridspec_kw=at | {"hspace": 0.12, "wspace": 0.1}
         )
         figure.text(0.01, 1 - 0.25 / height_in, title, fontsize=13)
         for name in panes.keys() & {"camera", "events", "face", "seen", "scan"}:
@@ -133,7 +138,7 @@ def _draw_events(
 ) -> None:
     """Draw recent events over the image, and in grey the start and end of the board's track."""
     shown = recent_events(image, events)
-    show_image(axes, image.pixels // 2)
+    show_image(axes, (_DIM * image.pixels).astype(np.uint8))
     for is_kind, colour in ((shown.polarity, BRIGHTER), (~shown.polarity, DARKER)):
         axes.plot(shown.x[is_kind], shown.y[is_kind], "s", color=colour, markersize=2, mew=0)
     if isinstance(result, ImageBoard):

@@ -127,8 +127,9 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
 
 # Maximum requests in the queue: repeated quick taps mean one request.
 _MOST_ASKED = 8
-#: Time between two looks for news, s; waking this thread would cost the collection a system call, and the
-#: interpreter's lock with it.
+# Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
+_LOOK_S = 0.03
+#: Time between two updates, s.
 PERIOD_S = 0.1
 #: Time without news after which the page gets a message, s, so that it sees the connection is alive.
 BEAT_S = 1.0
@@ -181,13 +182,13 @@ class Feed:
         return None if newest is None else time.monotonic() - newest[1]
 
     async def wait_beyond(self, number: int, timeout_s: float) -> bool:
-        """Wait `PERIOD_S`, and for a state newer than `number`; False on timeout."""
+        """Wait for a state newer than `number`; False on timeout."""
         end_s = time.monotonic() + timeout_s
-        while True:
-            await asyncio.sleep(PERIOD_S)
-            is_new = self._newest is not None and self._newest[0] > number
-            if is_new or time.monotonic() > end_s:
-                return is_new
+        while self._newest is None or self._newest[0] <= number:
+            if time.monotonic() > end_s:
+                return False
+            await asyncio.sleep(_LOOK_S)
+        return True
 
 
 class Viewer:
@@ -213,7 +214,7 @@ class Viewer:
         with suppress(ConnectionError, asyncio.TimeoutError):
             while is_answered:
                 is_new = await self._feed.wait_beyond(self._state, BEAT_S)
-                newest = self._feed.newest()
+                began_s, newest = time.monotonic(), self._feed.newest()
                 if is_new and newest is not None:
                     self._state, state = newest
                     await asyncio.wait_for(self._send(state), ANSWER_S)
@@ -221,6 +222,7 @@ class Viewer:
                 else:
                     await self._line.send_str(beat(self._feed.age_s()))
                 is_answered = await self._read_answer()
+                await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
             await self._line.close(code=1008, message=b"only answers and requests are read")
 
     async def close(self) -> None:

@@ -86,7 +86,9 @@ def _network_addresses() -> list[str]:
 
 # 72 bits: beyond guessing, and can still be typed into a phone.
 _TOKEN_BYTES = 9
-_STOP_S = 1.5
+_STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
+# Time to read the rest of a request that was answered before its end, s.
+_LINGERING_S = 1.0
 # asyncio sets up a connection in the three turns of its loop after it has accepted it.
 _TURNS_TO_SET_UP = 4
 # Malformed requests from strangers must not be logged on the terminal that shows the collection.
@@ -183,6 +185,9 @@ class Preview:
             handle_signals=False,
             access_log=None,
             logger=_SILENT,
+            shutdown_timeout=_SHUTDOWN_S,
+            keepalive_timeout=_KEEP_ALIVE_S,
+            lingering_time=_LINGERING_S,
         )
         await runner.setup()
         await web.SockSite(runner, opened).start()
