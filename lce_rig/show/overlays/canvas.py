@@ -42,9 +42,9 @@ MAGENTA: Colour = (235, 60, 255)
 ORANGE: Colour = (60, 160, 255)
 RED: Colour = (40, 40, 200)
 
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-# Longest line of text under an image, letters.
-_N_LETTERS = 110
+# Text under an image: height of a line and mean width of a letter, in widths of the image; line height for
+# cv2's font of scale 1, px.
+_LINE, _LETTER, _FONT_PX = 0.022, 0.0085, 40.0
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
 # Images have large uniform areas and thin marks: run-length encoding compresses them as well as a search, in
 # half the time.
@@ -149,16 +149,15 @@ def draw_line(
 
 def with_note(picture: Picture, text: str, colour: Colour) -> Picture:
     """Add white text on a coloured band below an image."""
-    lines = textwrap.wrap(text, _N_LETTERS)
-    # Most letters are narrower than this one.
-    (line_width_px, letter_px), _ = cv2.getTextSize("n" * _N_LETTERS, _FONT, 1, 1)
-    scale = picture.shape[1] / line_width_px
-    line_px = 2 * scale * letter_px
+    line_px = _LINE * picture.shape[1]
+    lines = textwrap.wrap(text, round(1 / _LETTER))
     band = np.empty((round((len(lines) + 0.5) * line_px), *picture.shape[1:]), dtype=np.uint8)
     band[:] = colour
     for k, line in enumerate(lines, start=1):
-        at, width_px = (round(0.5 * line_px), round(k * line_px)), max(1, round(line_px / 24))
-        cv2.putText(band, line, at, _FONT, scale, WHITE, width_px, cv2.LINE_AA)
+        at, width_px = (round(0.5 * line_px), round(k * line_px)), max(1, round(line_px / 18))
+        cv2.putText(
+            band, line, at, cv2.FONT_HERSHEY_SIMPLEX, line_px / _FONT_PX, WHITE, width_px, cv2.LINE_AA
+        )
     return np.concatenate([picture, band])
 
 
