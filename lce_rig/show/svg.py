@@ -22,6 +22,8 @@ LEFT, RIGHT, TOP, BOTTOM = 4 * EM, EM, 2 * EM, 4 * EM
 """Margins around the axes, for ticks and labels."""
 # Distance of texts from the axes.
 _GAP = EM / 2
+# Fraction of the font size from the middle of a digit to the baseline.
+_MIDDLE = 0.36
 # Axes of equal scales have one step, of the longer one.
 _MOST_STEPS, _MOST_EQUAL_STEPS = 5, 8
 # Share of the range that stays free on either side.
@@ -29,8 +31,7 @@ _MARGIN = 0.05
 # Distant marks are moved here, outside every drawing.
 _FAR = 10 * WIDTH
 # An arrow's half-widths of shaft and head, and the length of its head.
-_SHAFT = 0.6
-_HEAD, _HEAD_LENGTH = 3 * _SHAFT, 9 * _SHAFT
+_SHAFT, _HEAD, _HEAD_LENGTH = 0.6, 1.8, 5.4
 
 
 def padded(*values: Array, least: float = 0.0) -> tuple[float, float]:
@@ -122,7 +123,7 @@ class Axes:
             lines += f"M{x:.2f} {top:.2f}V{bottom:.2f}" * ("x" in grid)
         for value, label in round_ticks(min(y_limits), max(y_limits), steps[1]):
             y = float(self.at([[0, value]])[0, 1])
-            self._write(left - _GAP, y + EM / 3, label, "end", QUIET)
+            self._write(left - _GAP, y + _MIDDLE * EM, label, "end", QUIET)
             lines += f"M{left:.2f} {y:.2f}H{right:.2f}" * ("y" in grid)
         if lines:
             self._behind.append(f'<path d="{lines}" style="{_stroke(FAINT, 0.5)}"/>')
@@ -186,7 +187,7 @@ class Axes:
         """
         # Vectors turn with the axes.
         self._group([f'<path d="{_arrows(self.at(starts), vectors * self._scale)}"/>'], f"fill: {colour}")
-        length, y = unit * abs(float(self._scale[0])), self._box[1] - _GAP - EM / 3
+        length, y = unit * abs(float(self._scale[0])), self._box[1] - _GAP - _MIDDLE * EM
         tail = np.array([[self._box[2] - length, y]])
         self._front.append(f'<path d="{_arrows(tail, np.array([[length, 0.0]]))}" style="fill: {colour}"/>')
         self._write(float(tail[0, 0]) - 4, self._box[1] - _GAP, key, "end", INK)

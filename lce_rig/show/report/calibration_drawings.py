@@ -74,6 +74,10 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     )
 
 
+# Height of drawings of residuals.
+_LOW = 173.0
+
+
 def _image_axes(lens: Intrinsics) -> Axes:
     """Start a drawing with axes as the camera's image, pixels, v down."""
     width = svg.WIDTH - svg.LEFT - svg.RIGHT
@@ -166,7 +170,7 @@ def _residual_axes(
     """Start a drawing of residuals with a line at 0 and bars of one standard deviation."""
     low_mm, high_mm = mean_mm - spread_mm, mean_mm + spread_mm
     y_limits = svg.padded(low_mm, high_mm, np.zeros(1))
-    axes = Axes(svg.WIDTH / 2, x_limits, y_limits, x_label=x_label, y_label="behind the plane, mm", grid="y")
+    axes = Axes(_LOW, x_limits, y_limits, x_label=x_label, y_label="behind the plane, mm", grid="y")
     axes.horizontal(0.0, QUIET)
     axes.lines(np.stack([x, low_mm], axis=1), np.stack([x, high_mm], axis=1), FAINT, width=1.2)
     return axes
