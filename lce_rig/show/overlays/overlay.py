@@ -32,7 +32,7 @@ from lce_rig.show.page import render
 
 PAGE = "index.html"
 _WIDTH_IN = 16
-_TITLE_IN, _MANY = 0.3, 600  # Height of a title; number of edges that are drawn small.
+_TITLE_IN, _WIDE, _MANY = 0.3, 2.0, 600  # Height of a title; ratio of a wide image; edges drawn small.
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
 # Number of scans that determine the range scale of a session's images.
@@ -98,7 +98,7 @@ def draw_projection(
 def draw_edges(
     image: Image, edges: Outlines, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
 ) -> Picture:
-    """Draw a scan's edges into the image under several extrinsics, side by side, or stacked if still wide.
+    """Draw a scan's edges into the image under several extrinsics, side by side; wide images are stacked.
 
     Args:
         image: image of the capture.
@@ -113,7 +113,7 @@ def draw_edges(
     from matplotlib.figure import Figure
 
     height_px, width_px = image.pixels.shape[:2]
-    n_rows, n_columns = (len(poses), 1) if width_px > len(poses) * height_px else (1, len(poses))
+    n_rows, n_columns = (len(poses), 1) if width_px > _WIDE * height_px else (1, len(poses))
     height_in = _WIDTH_IN / n_columns * height_px / width_px
     figure: Any = Figure(figsize=(_WIDTH_IN, n_rows * (height_in + _TITLE_IN)), dpi=100)
     panes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
