@@ -27,6 +27,7 @@ from lce_rig.core.phrasing import sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, lacks_captures
+from lce_rig.judge.reach import USUAL_M
 from lce_rig.pipeline.detect_session import unlike_models
 from lce_rig.pipeline.findings import CHANNEL_REJECTED, FEW_DETECTED, absent_channels
 from lce_rig.pipeline.result_files import result_folder
@@ -45,8 +46,8 @@ _CORRECTED = {
     "verdict.laser_angles",
     "verdict.plate_size",
 }
-# Number of reasons printed without --explain, and distance of the point with printed uncertainty, m.
-_N_REASONS, _FAR_M = 3, 10.0
+# Number of reasons printed without --explain.
+_N_REASONS = 3
 
 
 def residual_words(metrics: Metrics, c: Calibration) -> str:
@@ -70,9 +71,9 @@ def _uncertainty(c: Calibration, *, is_by_axis: bool) -> Iterator[str]:
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
     for point in c.uncertainty:
-        if point.distance_m == _FAR_M:
+        if point.distance_m == USUAL_M:
             off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
-            yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
+            yield f"  {USUAL_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
 
 
 @click.command()

@@ -26,6 +26,7 @@ from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import (
     MEMORY_NS,
     MIN_SPEED_MPS,
+    SLOW_EVENTS_PX,
     event_quality,
     explain_missing_board,
     outline_px,
@@ -208,8 +209,6 @@ def _plane_motion_m(
 BEST_SPEED_MPS = 0.1
 
 _LEAST_DETECTIONS = 3
-# Minimum event rate per pixel, 1/s, of a board slower than `MIN_SPEED_MPS`.
-_PLENTY_EVENTS_PX = 4.0
 # Time without events while the board moves after which a camera's stream counts as ended, ns.
 _SILENT_NS = 100_000_000
 
@@ -285,7 +284,7 @@ def _judge_camera(
     if speed_mps > limits.max_board_speed_mps:
         return too_fast(speed_mps, limits.max_board_speed_mps)
     is_slow = speed_mps < MIN_SPEED_MPS
-    needed_px = max(_PLENTY_EVENTS_PX if is_slow else 0.0, limits.min_events_px)
+    needed_px = max(SLOW_EVENTS_PX if is_slow else 0.0, limits.min_events_px)
     if events_px < needed_px:
         if not is_slow and cut.last_ns < detection.frame.time_ns - _SILENT_NS:
             return READ_NO_EVENTS_AT_SCAN.refusal()

@@ -19,7 +19,6 @@ from lce_rig.core.errors import LceRigError, SourceError
 # Thread settings of numerical libraries, read when they are loaded: this process and the worker already
 # occupy two cores, so more threads would only wait.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-_CLOSE_S = 2.0
 
 
 class Worker:
@@ -52,11 +51,8 @@ class Worker:
         # A call waiting in another thread clears the process at its end.
         self._is_closed, process = True, self._process
         if process is not None:
-            process.terminate()
-            try:
-                process.wait(_CLOSE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
+            process.kill()
+            process.wait()
 
     def call(self, method: str, *arguments: object) -> Any:
         """Call a method of the object, and return its result.

@@ -110,6 +110,10 @@ T_BODY_OPTICAL = pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3)
 """REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own."""
 
 
+ROUNDING = 5e-3
+"""Tolerance on a rotation from a file: printed with few digits, a quaternion's norm is off by 1e-3."""
+
+
 def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
     """Build a pose from parsed text: four lists of four numbers.
 

@@ -18,7 +18,6 @@ from lce_rig.rig import CameraSettings, LidarSettings
 # Longest silence, and time for discovery, s: nodes find each other within a second on one computer, within a
 # few on a network.
 _SILENCE_S = _DISCOVERY_S = 5.0
-_DISCOVERY_STEP_S = 0.1
 
 
 class Ros2Source(LiveSource):
@@ -133,7 +132,7 @@ class Ros2Source(LiveSource):
             }
             if self._topic in types or time.monotonic() > until_s or self.is_stopping:
                 break
-            time.sleep(_DISCOVERY_STEP_S)
+            time.sleep(READ_WAIT_S)
         fitting = [each for each in types.get(self._topic, ()) if each in self._target.types]
         if fitting:
             return fitting[0]

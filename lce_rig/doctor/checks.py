@@ -39,8 +39,8 @@ _TIMEX_LONGS, _MAX_ERROR_LONG, _TIME_ERROR = 32, 3, 5
 # Largest relative error of the rate of the sync board's pulses.
 _MAX_OFF_PULSES = 0.02
 _STOPPED_S = 1.0
-# Tolerance on the counts of frames and pulses, absolute and relative: both arrive in bursts.
-_ROOM, _MAX_UNLIKE = 2, 0.01
+# Tolerance on the counts of frames and pulses: both arrive in bursts.
+_ROOM = 2
 
 
 def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
@@ -229,7 +229,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
         last_ns = min(frames_ns[-1], pulses[-1].host_ns)
         n_frames, n_pulses = (_count(each, first_ns, last_ns) for each in (seen.frames, pulses))
     yield findings.FRAMES_OF_PULSES(n_frames=n_frames, n_pulses=n_pulses)
-    if abs(n_frames - n_pulses) > _ROOM + _MAX_UNLIKE * n_pulses:
+    if abs(n_frames - n_pulses) > _ROOM + MAX_LOST_SHARE * n_pulses:
         yield findings.UNEQUAL()
     trigger, clock = sync.triggers[sensor], board.host_clock
     if clock is None or trigger.rate_hz * trigger.max_delay_s >= 1:

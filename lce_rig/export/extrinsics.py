@@ -12,7 +12,7 @@ from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError, reading
 from lce_rig.core.files import read_json
-from lce_rig.core.geometry import Array, invert, parse_pose, transform
+from lce_rig.core.geometry import ROUNDING, Array, invert, parse_pose, transform
 from lce_rig.export import ExportJob
 from lce_rig.export.writing import quaternion_xyzw
 from lce_rig.rig import Rig
@@ -106,10 +106,6 @@ def _pose_block(meaning: str, T: Array) -> dict[str, Any]:
     }
 
 
-# References are often printed with four digits.
-_ROUNDING = 5e-3
-
-
 @dataclass(frozen=True, eq=False)
 class Reference:
     """T_cam_lidar (4, 4) by (camera, lidar), and a default for other pairs."""
@@ -145,7 +141,7 @@ def read_reference(path: Path | str) -> Reference:
 
 def _pose(path: Path, key: str, holder: Mapping[str, Any]) -> Array:
     try:
-        return parse_pose(holder.get("T_cam_lidar"), _ROUNDING)
+        return parse_pose(holder.get("T_cam_lidar"), ROUNDING)
     except ValueError as error:
         raise SessionError(
             f"{path}: {key} {error}",

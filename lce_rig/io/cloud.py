@@ -25,7 +25,6 @@ TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset",
 _FARTHEST_MEDIAN = 3.0
 # A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
-_LATEST = 1e19
 _MOST_RINGS = 1024
 # A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
 _MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
@@ -358,7 +357,7 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
         return ticks if np.ptp(ticks) > 0 else None
     ticks = values.astype(np.float64)
     # More than a century in nanoseconds is not a time in any unit.
-    if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
+    if not np.isfinite(ticks).all() or np.abs(ticks).max() > np.iinfo(np.int64).max or np.ptp(ticks) == 0:
         return None
     # The resolution of a float32 of Unix time is two minutes.
     step = float(np.spacing(np.abs(values).max()))

@@ -14,11 +14,10 @@ from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress
 from lce_rig.io.findings import CLOCK_SET_BACK, OUT_OF_ORDER
 from lce_rig.rig import Rig
+from lce_rig.timing.clock import NS_PER_S, SINCE_1970_NS
 from lce_rig.timing.scan_pairing import event_channel, rig_time_ns, stream_of
 
 _END_BYTES = 65536
-# September 2001: clocks that count from 1970 read more, those that count from their start less.
-_SINCE_1970_S = 1e9
 _CLOCK_JUMP_NS = 1_000_000_000
 # Gap below which streams count as overlapping, s: sensors start one after the other.
 _ROUGH_S = 0.2
@@ -258,7 +257,7 @@ def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iter
                     "If they were recorded together, add the difference of their clocks to "
                     f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
                 )
-            if min(scan_0, first) < _SINCE_1970_S <= max(scan_0, first):
+            if min(scan_0, first) < SINCE_1970_NS / NS_PER_S <= max(scan_0, first):
                 if scan_0 < first:
                     key = f"lidars.{lidar.sensor}.timestamps.expected_offset_s"
                 hint = (

@@ -16,7 +16,9 @@ from lce_rig.core.geometry import Array, PoseDifference, perturb, skew
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import LensModel, model_of
 
-DISTANCES_M = (5.0, 10.0, 20.0)
+USUAL_M = 10.0
+"""Distance of the point whose uncertainty a summary states."""
+DISTANCES_M = (5.0, USUAL_M, 20.0)
 """Distances of the points whose uncertainty is reported: beyond the boards, where rotation errors grow."""
 CHANGED_CHI2 = 27.86
 """Least chi-squared of changed extrinsics: a chance of 1e-4, as of explanations."""

@@ -56,7 +56,6 @@ Key = tuple[str, str]
 """Capture and channel of an image; of several sessions, the capture's name follows its session's."""
 # A typical field of view, 64 deg, if the profile's intrinsics are unusable.
 _GUESSED_FOCAL = 0.8
-_ANY_REPROJECTION_PX = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +148,7 @@ def measure_intrinsics(
     given = rig.cameras[camera].to_intrinsics()
     jobs, seen_in_events = _images_of(sessions, camera, chosen)
     start = given
-    found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
+    found = _look(rig, camera, jobs, start, np.inf, progress) | seen_in_events
     if _n_captures(found) < rig.quality.min_captures:
         width, height = given.width_px, given.height_px
         for (_, channel), capture in jobs.items():
@@ -159,7 +158,7 @@ def measure_intrinsics(
         focal, straight = _GUESSED_FOCAL * width, (0.0,) * len(given.distortion)
         middle = (width - 1) / 2, (height - 1) / 2
         start = Intrinsics(focal, focal, *middle, width, height, given.model, straight)
-        found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
+        found = _look(rig, camera, jobs, start, np.inf, progress) | seen_in_events
     estimate = _fit(camera, found, rig, start, model)
     # Wrong intrinsics may have caused a detection to fail: board, pose or single corners.
     limit_px = rig.quality.max_reprojection_px

@@ -6,11 +6,10 @@ from pydantic import Field, field_validator, model_validator
 
 from lce_rig.core.board import Board, BoardType
 from lce_rig.core.pattern import DICTIONARIES, LEAST_CORNERS, n_markers_of
-from lce_rig.rig.settings import Figure, Settings, problem
+from lce_rig.rig.settings import Deviation, Figure, Settings, problem
 
 # Limits of sizes, m; larger figures are in millimetres.
 _Side = Annotated[float, Field(ge=0.005, le=5)]
-_Deviation = Annotated[float, Field(ge=0, le=0.2)]
 _LEAST_SQUARE_M = 0.001
 _Count = Annotated[int, Field(ge=2, le=100)]
 _TagCount = Annotated[int, Field(ge=1, le=50)]
@@ -66,10 +65,10 @@ class BoardSettings(Settings):
     width_m: _Side
     height_m: _Side
     pattern_offset_m: tuple[Figure, Figure] = (0.0, 0.0)
-    square_sigma_m: _Deviation | None = None
-    pattern_offset_sigma_m: _Deviation = 0.003
-    plate_sigma_m: _Deviation = 0.002
-    bow_sigma_m: _Deviation = 0.001
+    square_sigma_m: Deviation | None = None
+    pattern_offset_sigma_m: Deviation = 0.003
+    plate_sigma_m: Deviation = 0.002
+    bow_sigma_m: Deviation = 0.001
 
     @field_validator("dictionary")
     @classmethod

@@ -11,7 +11,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.geometry import Array, invert, pose, project_to_so3
+from lce_rig.core.geometry import ROUNDING, Array, invert, pose, project_to_so3
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
@@ -75,8 +75,6 @@ UNKNOWN_MODEL = Kind(
 
 BOARD, PPS_LINE = "sync", "pps"
 """Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
-# CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
-_ROUNDING = 5e-3
 # Largest distance of two sensors of one rig, m; larger figures are in millimetres.
 _Metres = Annotated[float, Field(ge=-20, le=20)]
 
@@ -197,12 +195,12 @@ class NominalExtrinsic(Settings):
         if self.quaternion_wxyz is not None:
             norm = float(np.linalg.norm(self.quaternion_wxyz))
             what = f"not a unit quaternion: its norm is {norm:.4g}"
-            require(abs(norm - 1) <= _ROUNDING, what, "quaternion_wxyz")
+            require(abs(norm - 1) <= ROUNDING, what, "quaternion_wxyz")
         if self.matrix is not None:
             R = np.array(self.matrix)
             error = float(np.abs(R @ R.T - np.eye(3)).max())
             what = f"not a rotation: R R^T differs from the identity by {error:.3g}"
-            require(error <= 2 * _ROUNDING, what, "matrix")
+            require(error <= 2 * ROUNDING, what, "matrix")
             what = "not a rotation but a mirroring: its determinant is -1"
             require(np.linalg.det(R) > 0, what, "matrix")
         return self

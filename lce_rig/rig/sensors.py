@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import TYPICAL, VLP_16, DataSheet, find_data_sheet
 from lce_rig.rig.settings import (
+    Deviation,
     Figure,
     FrameName,
     Name,
@@ -25,8 +26,6 @@ MAX_PIXELS = 1 << 26
 
 LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
-# Limit above which a figure is in millimetres, or the sensor is broken.
-RangeError = Annotated[float, Field(ge=0, le=0.2)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
 _COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,), "4")}
@@ -162,8 +161,8 @@ class LidarSettings(Settings):
     beam_aperture_m: NotNegative
     beam_divergence_rad: NotNegative
     range_offset_m: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    laser_bias_sigma_m: RangeError
-    range_offset_sigma_m: RangeError
+    laser_bias_sigma_m: Deviation
+    range_offset_sigma_m: Deviation
     intrinsics: LidarIntrinsicsSettings | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()

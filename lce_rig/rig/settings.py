@@ -26,12 +26,14 @@ RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
 FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
 TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
 # Bounds of all figures of a rig, so that their squares and quotients do not overflow.
-_SMALLEST, _LARGEST = 1e-6, 1e6
+_LARGEST = 1e6
 Text = Annotated[str, Field(max_length=1000)]
-Positive = Annotated[float, Field(ge=_SMALLEST, le=_LARGEST)]
+Positive = Annotated[float, Field(ge=1 / _LARGEST, le=_LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 Figure = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
 Row = tuple[Figure, Figure, Figure]
+# Standard deviation of a length, m; larger figures are in millimetres, or a sensor is broken.
+Deviation = Annotated[float, Field(ge=0, le=0.2)]
 Rate = Annotated[float, Field(ge=0.1, le=10_000)]
 
 

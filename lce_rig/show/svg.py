@@ -14,16 +14,14 @@ from lce_rig.core.geometry import Array
 INK, QUIET, FAINT = "var(--ink)", "var(--quiet)", "var(--line)"
 BLUE, ORANGE = "var(--blue)", "var(--orange)"
 
+EM = 8.5
+"""Size of the font; all lengths of this module are units of the view box, as long as a point in print."""
 WIDTH = 320.0
-"""Width of every drawing: legible on a phone, and a wide screen shows several side by side.
-
-All lengths of this module are units of the view box, as long as a point in print.
-"""
-LEFT, RIGHT, TOP, BOTTOM = 30.0, 8.0, 18.0, 30.0
+"""Width of every drawing: legible on a phone, and a wide screen shows several side by side."""
+LEFT, RIGHT, TOP, BOTTOM = 4 * EM, EM, 2 * EM, 4 * EM
 """Margins around the axes, for ticks and labels."""
-# Size of the font, and distances of labels from the axes, in units of the view box.
-_FONT = 8.5
-_TICK_GAP, _LABEL_BELOW, _TITLE_ABOVE = 3.5, 23.0, 6.0
+# Distance of texts from the axes.
+_GAP = EM / 2
 # Fraction of the font size from the middle of a digit to the baseline.
 _MIDDLE = 0.36
 # Axes of equal scales have one step, of the longer one.
@@ -31,7 +29,7 @@ _MOST_STEPS, _MOST_EQUAL_STEPS = 5, 8
 # Share of the range that stays free on either side.
 _MARGIN = 0.05
 # Distant marks are moved here, outside every drawing.
-_FAR = 1e4
+_FAR = 10 * WIDTH
 # An arrow's half-widths of shaft and head, and the length of its head.
 _SHAFT, _HEAD, _HEAD_LENGTH = 0.6, 1.8, 5.4
 
@@ -111,8 +109,8 @@ class Axes:
         left, top, right, bottom = self._box
         border = f"M{left:.2f} {top:.2f}V{bottom:.2f}H{right:.2f}" + is_framed * f"V{top:.2f}Z"
         self._front.append(f'<path d="{border}" style="{_stroke(FAINT, 0.8)}"/>')
-        self._write((left + right) / 2, bottom + _LABEL_BELOW, x_label, "middle", QUIET)
-        self._write(left, top - _TITLE_ABOVE, y_label, "start", INK)
+        self._write((left + right) / 2, bottom + 3 * EM, x_label, "middle", QUIET)
+        self._write(left, top - _GAP, y_label, "start", INK)
 
     def _add_ticks(
         self, x_limits: tuple[float, float], y_limits: tuple[float, float], steps: list[float], grid: str
@@ -121,11 +119,11 @@ class Axes:
         lines = ""
         for value, label in round_ticks(min(x_limits), max(x_limits), steps[0]):
             x = float(self.at([[value, 0]])[0, 0])
-            self._write(x, bottom + _TICK_GAP + 0.75 * _FONT, label, "middle", QUIET)
+            self._write(x, bottom + _GAP + 0.75 * EM, label, "middle", QUIET)
             lines += f"M{x:.2f} {top:.2f}V{bottom:.2f}" * ("x" in grid)
         for value, label in round_ticks(min(y_limits), max(y_limits), steps[1]):
             y = float(self.at([[0, value]])[0, 1])
-            self._write(left - _TICK_GAP, y + _MIDDLE * _FONT, label, "end", QUIET)
+            self._write(left - _GAP, y + _MIDDLE * EM, label, "end", QUIET)
             lines += f"M{left:.2f} {y:.2f}H{right:.2f}" * ("y" in grid)
         if lines:
             self._behind.append(f'<path d="{lines}" style="{_stroke(FAINT, 0.5)}"/>')
@@ -189,10 +187,10 @@ class Axes:
         """
         # Vectors turn with the axes.
         self._group([f'<path d="{_arrows(self.at(starts), vectors * self._scale)}"/>'], f"fill: {colour}")
-        length, y = unit * abs(float(self._scale[0])), self._box[1] - _TITLE_ABOVE - _MIDDLE * _FONT
+        length, y = unit * abs(float(self._scale[0])), self._box[1] - _GAP - _MIDDLE * EM
         tail = np.array([[self._box[2] - length, y]])
         self._front.append(f'<path d="{_arrows(tail, np.array([[length, 0.0]]))}" style="fill: {colour}"/>')
-        self._write(float(tail[0, 0]) - 4, self._box[1] - _TITLE_ABOVE, key, "end", INK)
+        self._write(float(tail[0, 0]) - 4, self._box[1] - _GAP, key, "end", INK)
 
     def _group(self, elements: Sequence[str], style: str) -> None:
         self._marks.append(f'<g style="{style}">{"".join(elements)}</g>')
@@ -207,7 +205,7 @@ class Axes:
         left, top, right, bottom = self._box
         parts = [
             f'<svg viewBox="0 0 {WIDTH:g} {self._height:.2f}" role="img" aria-label="{escape(label)}"'
-            f' style="font-size: {_FONT}px">',
+            f' style="font-size: {EM}px">',
             f'<clipPath id="{escape(name)}"><rect x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}"'
             f' height="{bottom - top:.2f}"/></clipPath>',
             *self._behind,

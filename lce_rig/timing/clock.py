@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
+# September 2001: clocks that count from 1970 read more, those that count from their start less.
+SINCE_1970_NS = 10**18
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
 FOREVER_NS = 2**62

@@ -47,10 +47,9 @@ _MAX_SHARE = 0.25
 # linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
-# Standard deviation of one capture's board plane between camera and LiDAR.
-_PLANE_SIGMA_M = 0.005
-# A motion that moves the board by more than this without changing the planes counts as undetermined.
-_MAX_WEAK_SIGMA_M = 0.1
+# A motion that changes the planes of all captures together by less, relative to how far it moves the boards,
+# counts as undetermined: noise of 5 mm of one capture's plane would let it move them by 10 cm.
+_LEAST_CHANGE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,13 +166,13 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
         NotEnoughDataError: a direction is undetermined; it is named.
     """
     x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(1)]))
-    planes = Weights(PLANE_FREEDOMS / _PLANE_SIGMA_M**2, 0.0)
+    planes = Weights(PLANE_FREEDOMS, 0.0)
     hessians = problem.quadratics(x, problem.associate(x[None])[0], weights=planes).hessians
     lever_m = float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     information = hessians.sum(axis=0)[:6, :6] / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(information)
-    weak = values < 1 / _MAX_WEAK_SIGMA_M**2
+    weak = values < _LEAST_CHANGE**2
     if not weak.any():
         return
     # Unit vectors near one direction do not vary along it, so use the smaller of the two lateral spreads.

@@ -19,7 +19,7 @@ from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 
 N_ROTATION = 9
 # Limit of Newton steps, and length of the last one, rad: the next would be below double precision.
-_MAX_STEPS, _TOLERANCE_RAD = 50, 1e-8
+_MAX_STEPS, _TOLERANCE_RAD = 50, np.sqrt(np.finfo(float).eps)
 # Eigenvalues of the linear block below this fraction of the largest count as unobserved.
 _RELATIVE_FLOOR = 1e-12
 

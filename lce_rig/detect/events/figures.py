@@ -129,10 +129,8 @@ def _length(vector: Array, cov: Array) -> tuple[float, float]:
     return length, float(np.sqrt(vector @ cov @ vector)) / length
 
 
-# Boards at 2 to 5 cm/s cause 2 to 4 events/px in 1 s; below, a missing board was too slow.
-_SLOW_EVENTS_PX = 4.0
-
-
+#: Boards at 2 to 5 cm/s cause 2 to 4 events/px in 1 s; below, a missing board was too slow.
+SLOW_EVENTS_PX = 4.0
 #: Slower boards hardly make events.
 MIN_SPEED_MPS = 0.03
 
@@ -206,7 +204,7 @@ def explain_missing_board(
     # Take as many pixel blocks as a board covers, busiest first.
     of_blocks = np.sort(events_per_block(recent))[::-1]
     busiest = of_blocks[: max(1, round(_BUSY_SHARE * len(of_blocks)))]
-    events_px, needed_px = float(busiest.mean()) / BLOCK_PX**2, max(_SLOW_EVENTS_PX, limits.min_events_px)
+    events_px, needed_px = float(busiest.mean()) / BLOCK_PX**2, max(SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
         return too_few_events(events_px, needed_px, frame_speed_mps)
     return seen

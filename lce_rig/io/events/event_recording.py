@@ -15,6 +15,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.findings import worded
+from lce_rig.timing.clock import SINCE_1970_NS
 
 NS_PER_US = 1000
 MAX_EVENT_PIXELS = 1 << 22
@@ -26,8 +27,6 @@ _CLOCK_SET_NS = 1_000_000_000
 # Maximum fraction of events outside the sensor that counts as damage; more are another sensor's.
 _MAX_OFF_SHARE = 0.01
 _HOST_STRETCHES = 200
-# September 2001: clocks that count from 1970 read more, those that count from their start less.
-_SINCE_1970_NS = 10**18
 
 
 class NoEventsError(SourceError):
@@ -153,7 +152,7 @@ class EventRecording:
             for stretch in islice(self, _HOST_STRETCHES)
             if stretch.host_ns is not None
         ]
-        if start_ns < _SINCE_1970_NS and delays_ns and start_ns + min(delays_ns) >= _SINCE_1970_NS:
+        if start_ns < SINCE_1970_NS and delays_ns and start_ns + min(delays_ns) >= SINCE_1970_NS:
             self._shift_ns = min(delays_ns) // NS_PER_US * NS_PER_US
             self._assumed.append(
                 f"{self.sensor}'s events count from the sensor's start; {self._shift_ns * 1e-9:.6f} s added, "

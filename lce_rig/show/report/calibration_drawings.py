@@ -74,8 +74,8 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     )
 
 
-# Heights of drawings: square ones, and those of residuals.
-_SQUARE, _LOW = svg.WIDTH, 173.0
+# Height of drawings of residuals.
+_LOW = 173.0
 
 
 def _image_axes(lens: Intrinsics) -> Axes:
@@ -111,7 +111,7 @@ def draw_from_above(
     far_m = float(np.linalg.norm(shown, axis=1).max())
     low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
     axes = Axes(
-        _SQUARE,
+        svg.WIDTH,
         (high[0], low[0]),
         (low[1], high[1]),
         x_label="left of the LiDAR, m",

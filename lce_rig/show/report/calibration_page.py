@@ -23,6 +23,7 @@ from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.findings import advice_of
+from lce_rig.judge.reach import USUAL_M
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.overlays.canvas import Thumbnail, Thumbnails, accumulated, reduced
@@ -32,8 +33,6 @@ from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.tables import result_tables, rig_table, scene_words
 
 _LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
-# Distance at which the report states the expected error, m.
-_USUAL_M = 10.0
 # Ratio to the median residual from which captures are marked; maximum number of images on a page.
 _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
@@ -191,7 +190,7 @@ def _statement(c: Calibration) -> str:
     text = f"{known}; {'every check passed' if c.verdict == 'pass' else 'use it with care'}."
     if not c.uncertainty:
         return text
-    at = min(c.uncertainty, key=lambda point: abs(point.distance_m - _USUAL_M))
+    at = min(c.uncertainty, key=lambda point: abs(point.distance_m - USUAL_M))
     return (
         f"{text} A LiDAR point {at.distance_m:g} m away falls onto the image with an expected error of "
         f"{at.centre_px:.1f} px ({100 * at.centre_m:.1f} cm) in the middle and {at.corner_px:.1f} px "
