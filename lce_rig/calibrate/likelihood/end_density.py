@@ -13,6 +13,7 @@ lost   the last returns on the board are missing (weak, or merged with the perso
 stray  anything else (the neighbouring ray hit an object just behind the board), a Cauchy distribution.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -43,6 +44,20 @@ def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
     Returns:
         p and dp/dx, (M,) each.
     """
+    return _mixed(*_parts(x, blur), lost_share)
+
+
+def _mixed(densities: Sequence[Array], slopes: Sequence[Array], lost_share: float) -> tuple[Array, Array]:
+    """Sum `_parts` with their shares."""
+    shares = (1 - lost_share - STRAY, lost_share, STRAY)
+    p, slope = (
+        sum(share * part for share, part in zip(shares, parts, strict=True)) for parts in (densities, slopes)
+    )
+    return np.asarray(p), np.asarray(slope)
+
+
+def _parts(x: Array, blur: Array) -> tuple[Sequence[Array], Sequence[Array]]:
+    """Compute core, lost and stray of (1), and their derivatives."""
     from scipy.special import ndtr
 
     t = np.maximum(blur, _NARROWEST)
@@ -53,12 +68,7 @@ def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
     width = np.maximum(t, 1.0)
     stray = 1 / (np.pi * width * (1 + (x / width) ** 2))
     stray_slope = -2 * x * np.pi / width * stray**2
-    shares = (1 - lost_share - STRAY, lost_share, STRAY)
-    p, slope = (
-        sum(share * part for share, part in zip(shares, parts, strict=True))
-        for parts in ((core, lost, stray), (core_slope, lost_slope, stray_slope))
-    )
-    return np.asarray(p), np.asarray(slope)
+    return (core, lost, stray), (core_slope, lost_slope, stray_slope)
 
 
 def _exponential_with_noise(x: Array, t: Array) -> Array:
@@ -121,7 +131,8 @@ def _log_informations() -> Array:
     # Finest where the core rises and falls.
     at = np.sign(x) * np.abs(x) ** 2 * (12.0 + 8.0 * _BLURS)
     blurs = np.broadcast_to(_BLURS, at.shape)
-    both = (density(at, blurs, float(share)) for share in _SHARES)
+    parts = _parts(at, blurs)
+    both = (_mixed(*parts, float(share)) for share in _SHARES)
     return np.array([np.log(np.trapezoid(slope**2 / p, at, axis=0)) for p, slope in both])
 
 
