@@ -38,6 +38,7 @@ _PARALLEL, _ONE_PLACE = 90, 91
 _FIRST_PARALLEL, _FIRST_IN_ONE_PLACE = 1000, 2000
 # Recordings with approximate or unfit intrinsics, or with long ranges, as published.
 _FAULTS: Mapping[str, Codes] = {
+    "os1_64": LENS,
     "os1_gen1": RANGE_OFFSET,
     "vlp16_tilted": LENS,
     "vlp32c_left": LENS,
