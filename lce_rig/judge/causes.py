@@ -142,7 +142,7 @@ def _displacement(cause: Selected, reason: Finding) -> Sensitivity:
 
 
 def is_explained(selected: Sequence[Selected], estimate: CalibrationEstimate) -> bool:
-    """Check whether the causes bring the planes of both sensors together, so that symptoms follow from them."""
+    """Check whether the causes bring both sensors' planes together, so that symptoms follow from them."""
     most_m = max(estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M) / 2
     return bool(selected) and selected[-1].after.planes_apart_m <= most_m
 

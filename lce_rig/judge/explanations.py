@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.likelihood.hypothesis import Hypothesis
 from lce_rig.calibrate.likelihood.layout import Indices
 from lce_rig.calibrate.quadratics import Quadratics
-from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.geometry import Array, difference
 
 Cause = Literal[
     "squares",

@@ -9,9 +9,10 @@ from scipy.stats import chi2 as chi_squared
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.hypothesis import at_full_weight
 from lce_rig.calibrate.options import Tolerances
-from lce_rig.core.geometry import Array, fit_plane, perturb, tangent_sizes
+from lce_rig.core.geometry import Array, fit_plane, invert, perturb, tangent_sizes, transform
+from lce_rig.core.pattern import is_dark
 from lce_rig.judge.causes import find_causes, hypothesis_of
-from lce_rig.judge.explanations import ALL, Table, explain, log10_chance
+from lce_rig.judge.explanations import ALL, MOUNTINGS, Table, explain, log10_chance
 from lce_rig.lens.models import LensPrior
 from lce_rig.rig import CalibrationSettings
 from tests.calibrate.boards import BOARD, CAMERA, Scenario, simulate
@@ -59,6 +60,16 @@ def squares(factor):
         return seen_at(o, T)
 
     return lambda observations: [farther(o) for o in observations]
+
+
+def shorter_on_dark(excess_m):
+    def change(o):
+        rays = o.lidar.points / np.linalg.norm(o.lidar.points, axis=1, keepdims=True)
+        seen = transform(invert(o.lidar.T_lidar_board), o.lidar.points)[:, :2]
+        points = o.lidar.points - excess_m * is_dark(BOARD, seen)[:, None] * rays
+        return replace(o, surface=replace(o.lidar, points=points, plane=fit_plane(points)[0]))
+
+    return lambda observations: [change(o) for o in observations]
 
 
 def explained(observations, method="ml"):
@@ -195,6 +206,19 @@ def test_explain_level_of_noise_does_not_hide_a_move():
     (found,) = explained(observations)
     assert found.gain.cause == "moved"
     assert found.gain.log10_chance < -6
+
+
+@pytest.mark.parametrize(("excess_m", "first"), [(0.008, 7), pytest.param(0.015, 3, marks=pytest.mark.long)])
+def test_find_causes_harmless_contrast_hides_no_move(excess_m, first):
+    sound = shorter_on_dark(excess_m)(observed(10, 9))
+    observations = moved(sound, lambda k: k >= first, [0, 0, 0, 0, np.radians(1.5), 0])
+    estimate = fit_extrinsic(observations, BOARD, SETTINGS)
+    hypothesis = hypothesis_of(estimate, ())
+    found = find_causes(hypothesis, estimate, CalibrationSettings(), ALL)
+    (reason,) = (each for each in found if each.gain.cause in MOUNTINGS)
+    assert reason.gain.cause == "moved"
+    assert hypothesis.captures[reason.gain.explanation.cut] == f"{first:06d}"
+    assert tangent_sizes(reason.change)[0] == pytest.approx(1.5, abs=0.4)
 
 
 @pytest.mark.long
