@@ -23,7 +23,7 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.verdict import MAX_PLANE_MISFIT_M
+from lce_rig.judge.causes import MAX_PLANE_MISFIT_M
 from lce_rig.pipeline.camera_intrinsics import write_profile
 from lce_rig.pipeline.comparison import name_sessions, require_independent, require_one_board
 from lce_rig.pipeline.detect_session import detect_boards
