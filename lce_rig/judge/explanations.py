@@ -421,7 +421,7 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
     Yields:
         The explanations assumed, in order.
     """
-    left = frozenset(causes)
+    left, first, members = frozenset(causes), hypothesis, np.zeros(len(hypothesis.captures))
     for _ in range(_MOST):
         table = Table(hypothesis, left)
         rows, late = table.rows(), table.moves_of_rejected()
@@ -448,6 +448,12 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
                 best = min(best, _assume(hypothesis, noisy, row), key=_rank)
         if best.gain.log10_chance > _LEAST:
             return
+        if best.gain.cause == "alone":
+            members = members + best.gain.explanation.weights
+            if members.sum() >= _FEWEST_OF_GROUP:
+                # Far from the others, captures of one other mounting are found one by one.
+                row = Gain(Explanation("groups", members, 2.0 ** (len(members) - 1)), 0.0, 6, np.zeros(6))
+                best = min(best, _assume(first, first.with_fitted_noise, row), key=_rank)
         yield best
         if best.after is hypothesis:
             return
