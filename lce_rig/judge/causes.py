@@ -109,7 +109,11 @@ def report_causes(
     Returns:
         The findings, and the displacement of the extrinsics that resolves the reason, if there is one.
     """
-    by_size = sorted(selected, key=lambda s: -rig.calibration.in_targets(*tangent_sizes(s.change)))
+
+    def rank(each: Selected) -> tuple[bool, float]:
+        return each.gain.cause == "alone", -rig.calibration.in_targets(*tangent_sizes(each.change))
+
+    by_size = sorted(selected, key=rank)
     named = [(each, _finding(each, estimate, rig, camera, lidar)) for each in by_size]
     found = [finding for _, finding in named if finding is not None]
     reasons = [(f, each) for s in ("error", "warning") for each, f in named if f and f.severity == s]
@@ -143,7 +147,8 @@ def _displacement(cause: Selected, reason: Finding) -> Sensitivity:
 
 def is_explained(selected: Sequence[Selected], estimate: CalibrationEstimate) -> bool:
     """Check whether the causes bring both sensors' planes together, so that symptoms follow from them."""
-    most_m = max(estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M) / 2
+    # NaN if the method has no such residual.
+    most_m = float(np.fmax(estimate.diagnostics.fit_plane_rms_m, MAX_PLANE_MISFIT_M)) / 2
     return bool(selected) and selected[-1].after.planes_apart_m <= most_m
 
 
