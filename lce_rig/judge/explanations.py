@@ -146,6 +146,11 @@ class Gain(NamedTuple):
         """Of the explanation."""
         return self.explanation.cause
 
+    @property
+    def key(self) -> tuple[Cause, int]:
+        """Tells it from other explanations of the table."""
+        return self.explanation.cause, self.explanation.cut
+
 
 class Selected(NamedTuple):
     """An explanation that was assumed.
@@ -422,30 +427,31 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         The explanations assumed, in order.
     """
     left, first, members = frozenset(causes), hypothesis, np.zeros(len(hypothesis.captures))
+    failed: dict[tuple[Cause, int], float] = {}
     for _ in range(_MOST):
         table = Table(hypothesis, left)
         rows, late = table.rows(), table.moves_of_rejected()
         if not rows or (rows[0].log10_chance > _TRIED and not late):
             return
         noisy = hypothesis.with_fitted_noise
-        tried = [*Table(noisy, left).rows()[:1], rows[0], *late]
-        # Causes that are similar at usual noise: after refitting, one may be much more probable than the
-        # other. A constant error that is there in addition does not hide a change.
-        for alike in _ALIKE:
-            likely = [row for row in rows if row.cause in alike and row.log10_chance < _TRIED]
-            tried += [row for row in likely if row.log10_chance < _LIKELY * likely[0].log10_chance]
+        tried = [*Table(noisy, left).rows()[:1], rows[0], *late, *_similar(rows, failed)]
         if rows[0].cause not in _UNSETTLED:
             tried = [row for row in tried if row.cause not in _UNSETTLED]
-        beside = [row for row in tried if row.cause in ("moved", "alone") and "moved" in left]
-        tried += [near for row in beside for near in table.moves_beside(row)]
-        once = {(row.cause, row.explanation.cut): row for row in tried}
-        best = min((_assume(hypothesis, noisy, row) for row in once.values()), key=_rank)
+        once = {row.key: row for row in tried}
+        found = {key: _assume(hypothesis, noisy, row) for key, row in once.items()}
+        for key, row in once.items():
+            if found[key].gain.log10_chance > _LEAST:
+                failed[key] = row.log10_chance
+            elif row.cause in ("moved", "alone"):
+                beside = [near for near in table.moves_beside(row) if near.key not in found]
+                found |= {near.key: _assume(hypothesis, noisy, near) for near in beside}
         # Far from the optimum (2) overstates the gain of many unknowns: of 5 captures with ranges 0.1 m too
         # long, the lens has -41, ranges -34, settled -6 and -18.
-        constant = rows if rows[0].cause in CONSTANT else []
+        constant = [row for row in rows if row.cause in CONSTANT] if rows[0].cause in CONSTANT else []
         for row in constant:
-            if row.cause in CONSTANT and (row.cause, 0) not in once and row.log10_chance < _rank(best):
-                best = min(best, _assume(hypothesis, noisy, row), key=_rank)
+            if row.key not in found and row.log10_chance < min(map(_rank, found.values())):
+                found[row.key] = _assume(hypothesis, noisy, row)
+        best = min(found.values(), key=_rank)
         if best.gain.log10_chance > _LEAST:
             return
         if best.gain.cause == "alone":
@@ -460,6 +466,23 @@ def explain(hypothesis: Hypothesis, causes: Sequence[Cause]) -> Iterator[Selecte
         hypothesis = best.after
         if best.gain.cause not in MOUNTINGS:
             left -= {best.gain.cause}
+
+
+def _similar(rows: Sequence[Gain], failed: Mapping[tuple[Cause, int], float]) -> Iterator[Gain]:
+    """List causes that are similar at usual noise: refitted, one may be much more probable than the other.
+
+    A constant error that is there in addition hides no change.
+
+    Args:
+        rows: of the table.
+        failed: log10 of the probabilities of explanations that proved insignificant. They are listed again
+            if they are ten times less probable without the error.
+    """
+    for alike in _ALIKE:
+        likely = [row for row in rows if row.cause in alike and row.log10_chance < _TRIED]
+        if likely and (likely[0] is rows[0] or "moved" in alike):
+            least = _LIKELY * likely[0].log10_chance
+            yield from (r for r in likely if r.log10_chance < min(least, failed.get(r.key, 0.0) - 1))
 
 
 def _rank(selected: Selected) -> float:
